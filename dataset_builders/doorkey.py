@@ -1,0 +1,148 @@
+"""DoorKey datasets: the noisy-rational expert of the paper, rolled out over the rules' tables."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE, REWARD
+from tqdm import tqdm
+
+from dataset_builders.writer import refuse_existing, write_dataset
+from lerobot_unimask.envs.doorkey import (
+    ACTIONS,
+    CELLS,
+    ENV_ID,
+    FPS,
+    HORIZON,
+    START_PAIRS,
+    TASK,
+    Expert,
+    expert_probabilities,
+    reward,
+    step,
+)
+from lerobot_unimask.returns import return_to_go
+
+CHUNK = 10_000  # episodes rolled out at a time
+
+FEATURES = {
+    OBS_STATE: {
+        "dtype": "int64",
+        "shape": (2,),
+        "names": ["agent_cell", "key_cell"],
+        "categories": [len(CELLS), len(CELLS)],
+    },
+    ACTION: {"dtype": "int64", "shape": (1,), "names": ["direction"], "categories": [len(ACTIONS)]},
+    "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": ["return_to_go"]},
+    REWARD: {"dtype": "float32", "shape": (1,), "names": None},
+    DONE: {"dtype": "bool", "shape": (1,), "names": None},
+}
+
+
+class Episodes(NamedTuple):
+    """E episodes of T = 10 steps; the states include the one after the last action."""
+
+    agent: np.ndarray  # (E, T + 1) int64, the agent's cell
+    key: np.ndarray  # (E, T + 1) int64, the key's cell
+    door_open: np.ndarray  # (E, T + 1) bool
+    action: np.ndarray  # (E, T) int64
+    reward: np.ndarray  # (E, T) int64
+
+
+def rollout(episodes: int, rng: np.random.Generator, *, expert: Expert = "paper", beta: float = 1.0) -> Episodes:
+    """Roll out the expert, all episodes at once.
+
+    Each episode takes the same number of draws from `rng`, one after another: so a first call for n episodes and a
+    second for m give the episodes of one call for n + m.
+
+    Raises:
+        ValueError: If `episodes` is below 1, `expert` unknown or `beta` not finite.
+    """
+    if episodes < 1:
+        raise ValueError(f"At least one episode is needed, got {episodes}.")
+    table = expert_probabilities(
+        CELLS[:, None, None], CELLS[:, None], np.array([False, True]), expert=expert, beta=beta
+    )
+    thresholds = table.cumsum(axis=-1)[..., :-1]  # (agent, key, door, 3)
+    draws = rng.random((episodes, 1 + HORIZON))
+    agent, key = START_PAIRS[(draws[:, 0] * len(START_PAIRS)).astype(np.int64)].T  # (E,)
+    door_open = np.zeros(episodes, dtype=bool)
+    states, actions = [(agent, key, door_open)], []
+    for draw in draws[:, 1:].T:
+        action = (draw[:, None] >= thresholds[agent, key, door_open.astype(np.int64)]).sum(axis=1)
+        agent, key, door_open = step(agent, key, door_open, action)
+        states.append((agent, key, door_open))
+        actions.append(action)
+    agents, keys, doors = (np.stack(column, axis=1) for column in zip(*states, strict=True))
+    return Episodes(agents, keys, doors, np.stack(actions, axis=1), reward(agents[:, :-1], agents[:, 1:]))
+
+
+def frames(episodes: Episodes) -> dict[str, np.ndarray]:
+    """The columns of `FEATURES`, (N, ...), of the steps that are stored: the state after the last action is not."""
+    count, horizon = episodes.action.shape
+    rewards = episodes.reward.reshape(-1).astype(np.float32)
+    return {
+        OBS_STATE: np.stack([episodes.agent[:, :-1], episodes.key[:, :-1]], axis=-1).reshape(-1, 2),
+        ACTION: episodes.action.reshape(-1, 1),
+        "observation.return_to_go": return_to_go(rewards, np.full(count, horizon))[:, None],
+        REWARD: rewards[:, None],
+        DONE: np.tile(np.arange(horizon) == horizon - 1, count)[:, None],
+    }
+
+
+def build_doorkey(
+    root: str | Path,
+    *,
+    episodes: int,
+    seed: int = 0,
+    expert: Expert = "paper",
+    repo_id: str | None = None,
+    beta: float = 1.0,
+    progress: bool = True,
+) -> Path:
+    """Roll out the expert and write a LeRobotDataset.
+
+    The same seed gives the same episodes, and a larger build begins with the episodes of a smaller one.
+
+    Args:
+        root: The dataset's folder: new, or an existing empty one.
+        episodes: How many; each has 10 steps.
+        seed: Of the starts and the actions.
+        expert: "paper" or "released", see `expert_progress`.
+        repo_id: The dataset's name, `ME/NAME`; `local/doorkey` if None.
+        beta: The expert's rationality.
+        progress: Show progress bars, on a terminal.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        FileExistsError: If `root` exists and is not an empty folder; it is left as it was.
+        ValueError: If an argument is out of range.
+    """
+    root = refuse_existing(root)  # now, rather than after the work
+    if episodes < 1 or seed < 0:
+        raise ValueError(f"episodes must be at least 1 and seed at least 0, got {episodes} and {seed}.")
+    rng = np.random.default_rng(seed)
+    chunks = [min(CHUNK, episodes - first) for first in range(0, episodes, CHUNK)]
+    bar = tqdm(chunks, desc="Rolling out DoorKey", unit="chunk", disable=None if progress else True)
+    parts = [frames(rollout(count, rng, expert=expert, beta=beta)) for count in bar]
+    provenance: dict[str, Any] = {
+        "environment": ENV_ID,
+        "expert": expert,
+        "beta": beta,
+        "seed": seed,
+        "episodes": episodes,
+    }
+    return write_dataset(
+        root,
+        repo_id=repo_id or "local/doorkey",
+        fps=FPS,
+        features=FEATURES,
+        columns={name: np.concatenate([part[name] for part in parts]) for name in FEATURES},
+        lengths=np.full(episodes, HORIZON),
+        task=TASK,
+        robot_type="doorkey",
+        provenance=provenance,
+        progress=progress,
+    )

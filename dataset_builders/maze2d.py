@@ -1,0 +1,254 @@
+"""Maze2D's expert, a waypoint controller, and the LeRobotDataset of its episodes (UniMASK, section 5.2).
+
+    python -m dataset_builders.maze2d --episodes 1000
+
+measures building side by side with stepping the environment as often, and prints JSON.
+"""
+
+import argparse
+import json
+import math
+import tempfile
+import time
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from dataset_builders.writer import dataset_statistics, episode_statistics, refuse_existing, write_dataset
+from lerobot_unimask.envs.maze2d import ENV_ID, FPS, HORIZON, TASK, Cell, Maze, Maze2DEnv, steps_to_goal
+from lerobot_unimask.returns import return_to_go
+
+FEATURES = {
+    "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
+    "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": ["return_to_go"]},
+    "action": {"dtype": "float32", "shape": (2,), "names": ["force_x", "force_y"]},
+    "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+}
+
+POSITION_GAIN = 10.0
+ARRIVED = 0.1  # within this distance a waypoint, or the goal, is reached
+WAYPOINT_SHIFT = 0.2  # waypoints are moved by up to this, towards smaller x and y
+
+
+@lru_cache(maxsize=1024)
+def next_cells(maze: Maze, goal: Cell) -> dict[Cell, Cell]:
+    """For every free cell but the goal, the first neighbour that is closer to `goal`."""
+    steps = steps_to_goal(maze, goal)
+    return {
+        cell: next(other for other in maze.neighbours(cell) if steps[other] < steps[cell])
+        for cell in maze.cells
+        if cell != goal
+    }
+
+
+def shortest_path(maze: Maze, start: Cell, goal: Cell) -> list[Cell]:
+    """The cells from `start` (left out) to `goal`; among shortest paths, the neighbours' order decides."""
+    following = next_cells(maze, goal)
+    path = []
+    while start != goal:
+        start = following[start]
+        path.append(start)
+    return path
+
+
+class WaypointExpert:
+    """D4RL's waypoint controller: planned once, at an episode's start; it sees the velocity that the policy does not.
+
+    The action is 10 (waypoint - position) - velocity, clipped to [-1, 1] per axis.
+
+    Args:
+        position: where the episode starts, (x, y); rounded, a free cell.
+        rng: moves every waypoint but the goal by -U(0, 0.2) per axis.
+    """
+
+    def __init__(self, maze: Maze, position: tuple[float, float], goal: Cell, rng: np.random.Generator):
+        start = (round(position[0]), round(position[1]))
+        if not maze.is_free(start):
+            raise ValueError(f"The expert cannot plan from {position}: the cell {start} is not free.")
+        path = np.array(shortest_path(maze, start, goal)[:-1], np.float64).reshape(-1, 2)
+        self.waypoints: list[tuple[float, float]] = [
+            *map(tuple, (path - rng.uniform(0, WAYPOINT_SHIFT, path.shape)).tolist()),
+            goal,
+        ]
+        self._next = 0
+
+    def act(self, position: tuple[float, float], velocity: tuple[float, float]) -> tuple[float, float]:
+        """The action at a position and (unclipped) velocity; then on to the next waypoint if this one is reached."""
+        goal = self.waypoints[-1]
+        at_goal = math.dist(position, goal) < ARRIVED
+        aim_x, aim_y = aim = goal if at_goal else self.waypoints[self._next]
+        x, y = position
+        velocity_x, velocity_y = velocity
+        if not at_goal and math.dist(position, aim) < ARRIVED:
+            self._next += 1
+        return _clip(POSITION_GAIN * (aim_x - x) - velocity_x), _clip(POSITION_GAIN * (aim_y - y) - velocity_y)
+
+
+def _clip(force: float) -> float:
+    return -1.0 if force < -1.0 else 1.0 if force > 1.0 else force
+
+
+def collect_episodes(
+    maze: str, episodes: int, seed: int, noise: float, progress: bool
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Run the expert for whole episodes; N = 200 episodes, frames in order.
+
+    Episode i depends on (seed, i, maze, noise) alone, and its start and goal not on the noise.
+
+    Returns:
+        The columns (N, ...) `observation.state`, `action` (as the environment received it), `next.reward` and
+        `next.done`; and each episode's initial velocity, float32 (episodes, 2), which the state hides.
+    """
+    env = Maze2DEnv(maze)
+    frames = episodes * HORIZON
+    states = np.empty((frames, 4), np.float32)
+    actions = np.empty((frames, 2), np.float32)
+    rewards = np.empty((frames, 1), np.float32)
+    initial_velocities = np.empty((episodes, 2), np.float32)
+    frame = 0
+    bar = tqdm(range(episodes), desc="Rolling out Maze2D", unit="episode", disable=None if progress else True)
+    for episode in bar:
+        start_seed, expert_seed = np.random.SeedSequence([seed, episode]).generate_state(2, np.uint64).tolist()
+        observation, _ = env.reset(seed=start_seed)
+        initial_velocities[episode] = env.velocity
+        rng = np.random.default_rng(expert_seed)
+        expert = WaypointExpert(env.maze, env.position, env.goal, rng)
+        for noise_x, noise_y in rng.normal(0.0, noise, (HORIZON, 2)).tolist():
+            action_x, action_y = expert.act(env.position, env.velocity)
+            states[frame] = observation["agent_pos"]
+            action = actions[frame]
+            action[0], action[1] = _clip(action_x + noise_x), _clip(action_y + noise_y)
+            observation, reward, _, _, _ = env.step(action)
+            rewards[frame] = reward
+            frame += 1
+    done = np.zeros((frames, 1), bool)
+    done[HORIZON - 1 :: HORIZON] = True
+    columns = {"observation.state": states, "action": actions, "next.reward": rewards, "next.done": done}
+    return columns, initial_velocities
+
+
+def build_maze2d(
+    root: str | Path,
+    *,
+    episodes: int,
+    seed: int = 0,
+    noise: float = 0.5,
+    maze: str = "medium",
+    repo_id: str | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write the expert's episodes, 200 frames each at 100 frames per second, as a LeRobotDataset.
+
+    The same arguments give the same episodes, and the first n of a larger build are those of a build of n. Provenance
+    holds `initial_velocity`, one (vx, vy) per episode: with the first frame's x, y and goal, `Maze2DEnv.reset(options=
+    {"position": ..., "velocity": ..., "goal": ...})` starts the episode again, and its stored actions replay it.
+
+    Args:
+        root: The dataset's folder: new, or an existing empty one.
+        noise: Standard deviation of the normal noise added to each action, before it is clipped to [-1, 1].
+        maze: Name or text, see `parse_maze`.
+        repo_id: The dataset's name, `ME/NAME`; `local/maze2d` if None.
+        progress: Show progress bars, on a terminal.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        FileExistsError: If `root` exists and is not an empty folder; it is left as it was.
+        ValueError: If an argument is out of range, or the maze bad.
+    """
+    root = refuse_existing(root)  # now, rather than after the work
+    if episodes < 1 or seed < 0:
+        raise ValueError(f"episodes must be at least 1 and seed at least 0, got {episodes} and {seed}.")
+    if not 0 <= noise < math.inf:
+        raise ValueError(f"noise is a standard deviation, a finite number from 0 up, got {noise}.")
+    columns, initial_velocities = collect_episodes(maze, episodes, seed, noise, progress)
+    lengths = np.full(episodes, HORIZON)
+    columns["observation.return_to_go"] = return_to_go(columns["next.reward"][:, 0], lengths)[:, None]
+    return write_dataset(
+        root,
+        repo_id=repo_id or "local/maze2d",
+        fps=FPS,
+        features=FEATURES,
+        columns=columns,
+        lengths=lengths,
+        task=TASK,
+        robot_type="maze2d",
+        provenance={
+            "environment": ENV_ID,
+            "maze": maze,
+            "expert": "waypoint controller",
+            "episodes": episodes,
+            "seed": seed,
+            "noise": noise,
+            "initial_velocity": initial_velocities.tolist(),
+        },
+        progress=progress,
+    )
+
+
+def measure_build(episodes: int = 1000, rounds: int = 3) -> dict[str, float]:
+    """Time stepping the environment and building a dataset of as many steps, in turns, in one process.
+
+    Stepping is `Maze2DEnv` alone, with actions drawn beforehand and a reset per episode. Building is `build_maze2d` as
+    a user runs it, files included, into a temporary folder. LeRobot's statistics are timed by themselves, over the
+    environment's own columns only, so `build_seconds` less `statistics_seconds` still holds those of the other columns.
+
+    Returns:
+        `steps`; `step_seconds`, `build_seconds` and `statistics_seconds`, each the least over the rounds;
+        `steps_per_second` of stepping; `ratio`, of building less statistics to stepping.
+    """
+    columns, _ = collect_episodes("medium", episodes, seed=0, noise=0.5, progress=False)
+    seconds = np.array(
+        [[_step_seconds(episodes), _build_seconds(episodes), _statistics_seconds(columns)] for _ in range(rounds)]
+    )
+    stepping, building, statistics = seconds.min(axis=0).tolist()
+    steps = episodes * HORIZON
+    return {
+        "steps": steps,
+        "step_seconds": stepping,
+        "build_seconds": building,
+        "statistics_seconds": statistics,
+        "steps_per_second": steps / stepping,
+        "ratio": (building - statistics) / stepping,
+    }
+
+
+def _step_seconds(episodes: int) -> float:
+    env = Maze2DEnv()
+    actions = np.random.default_rng(0).uniform(-1, 1, (episodes, HORIZON, 2)).astype(np.float32)
+    start = time.perf_counter()
+    for seed, episode in enumerate(actions):
+        env.reset(seed=seed)
+        for action in episode:
+            env.step(action)
+    return time.perf_counter() - start
+
+
+def _build_seconds(episodes: int) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        build_maze2d(Path(folder) / "maze2d", episodes=episodes, progress=False)
+        return time.perf_counter() - start
+
+
+def _statistics_seconds(columns: dict[str, np.ndarray]) -> float:
+    lengths = np.full(len(columns["action"]) // HORIZON, HORIZON)
+    start = time.perf_counter()
+    for column in columns.values():
+        dataset_statistics(episode_statistics(column, lengths))
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=measure_build.__doc__.splitlines()[0])
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=3)
+    print(json.dumps(measure_build(**vars(parser.parse_args())), indent=4))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""The policy's one config dataclass, `--policy.type=unimask`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from lerobot_unimask.masks import MAX_CONTEXT, RANDOM_MASK, mixture, parse
+from lerobot_unimask.window import RETURN_TO_GO, Feature
+
+TOKEN_LAYOUTS = ("stacked", "separate")
+
+
+@PreTrainedConfig.register_subclass("unimask")
+@dataclass
+class UniMASKConfig(PreTrainedConfig):
+    """Settings of a UniMASK policy. The defaults are the paper's random-mask model.
+
+    Raises:
+        ValueError: a setting outside its range, or one that contradicts another.
+        MaskError: a mask text that does not parse.
+    """
+
+    # The window
+    context_length: int = 10
+    # K: steps that the model sees at once.
+    drop_n_last_frames: int | None = None
+    # Frames at the end of an episode that start no training window; None: K - 1, which keeps to full windows.
+
+    # The questions
+    training_masks: list[str] | dict[str, float] | str = RANDOM_MASK
+    # What is trained on: one mask text or task name, a list, or a mapping to weights.
+    mask_seed: int = 0
+    # Training masks are a function of this seed, the update count and the frame's index.
+    inference_mask: str = "behavior_cloning"
+    # The question that acting asks at every step; it must ask for a[t].
+    target_return: float | None = None
+    # The return to ask for from an episode's first step on, shown as rtg[0] where the inference mask shows it.
+    given: dict[str, list[list[float]] | list[float] | float] = field(default_factory=dict)
+    # Values of single tokens in a rollout's window, {"s[-1]": [15, 15]}, in the dataset's units.
+    sample_actions: bool = False
+    # Act by sampling from the answer instead of taking its most likely action.
+
+    # The network
+    token_layout: str = "stacked"
+    # "stacked": one token per step, made of all its factors; "separate": one token per factor and step.
+    width: int = 128
+    depth: int = 3
+    heads: int = 8
+    feedforward_width: int = 512
+    dropout: float = 0.1
+
+    # The loss
+    loss_weights: dict[str, float] = field(default_factory=dict)
+    # Weight of each factor's loss, {"s": 0.5}; 1 where not named.
+
+    # The optimiser's preset
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 0.01
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 200
+
+    # Read off the training dataset and saved, so that a checkpoint knows what it was trained on.
+    features: dict[str, list[Feature]] = field(default_factory=dict)
+    # Factor name -> the dataset's columns that make it up.
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
+    )
+    # LeRobot's processors leave the numbers alone: the policy normalises, with statistics that it keeps itself.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.context_length <= MAX_CONTEXT:
+            raise ValueError(f"context_length is {self.context_length}; it must lie in 1 to {MAX_CONTEXT} steps.")
+        if self.drop_n_last_frames is None:
+            self.drop_n_last_frames = self.context_length - 1
+        if self.token_layout not in TOKEN_LAYOUTS:
+            raise ValueError(f"token_layout is {self.token_layout!r}; choose one of {', '.join(TOKEN_LAYOUTS)}.")
+        for name in ("width", "depth", "heads", "feedforward_width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.width % self.heads:
+            raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout is {self.dropout}; it must lie in [0, 1).")
+        if self.target_return is not None and "rtg[0]" in self.given:
+            raise ValueError("target_return and given both name rtg[0]; give one of them.")
+        # Syntax alone: which factors exist is known once the dataset or the checkpoint has been read.
+        for text in mixture(self.training_masks):
+            if text != RANDOM_MASK:
+                parse(text)
+        parse(self.inference_mask)
+
+    # LeRobot's contract
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        return list(range(self.context_length))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.context_length))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+    def set_dataset_feature_metadata(self, dataset_features: dict[str, dict[str, Any]]) -> None:
+        """Read the factors off a dataset's features; LeRobot calls this in training alone.
+
+        Raises:
+            ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
+        """
+        found = {key: _feature(key, entry) for key, entry in dataset_features.items() if _numeric(entry)}
+        features = _group(found)
+        if self.features and features != self.features:
+            raise ValueError(
+                "This checkpoint was trained on other features than the dataset has.\n"
+                f"  checkpoint: {_describe(self.features)}\n  dataset:    {_describe(features)}"
+            )
+        self.features = features
+
+    def validate_features(self) -> None:
+        """Where no dataset has said more, take the factors from LeRobot's input and output features, all continuous.
+
+        Raises:
+            ValueError: there is no action or no state.
+        """
+        if not self.features:
+            declared = {**(self.input_features or {}), **(self.output_features or {})}
+            sizes = {key: feature for key, feature in declared.items() if len(feature.shape) <= 1}
+            self.features = _group({key: _declared(key, feature) for key, feature in sizes.items()})
+
+
+def _numeric(entry: dict[str, Any]) -> bool:
+    return entry["dtype"] not in ("image", "video", "string", "language") and len(entry["shape"]) <= 1
+
+
+def _feature(key: str, entry: dict[str, Any]) -> Feature:
+    size = entry["shape"][0] if entry["shape"] else 1
+    categories = entry.get("categories")
+    if categories is not None and len(categories) != size:
+        raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
+    names = entry.get("names")
+    names = list(names) if isinstance(names, list | tuple) and len(names) == size else None
+    return Feature(key, size, list(categories) if categories is not None else None, names)
+
+
+def _declared(key: str, feature: PolicyFeature) -> Feature:
+    return Feature(key, feature.shape[0] if feature.shape else 1)
+
+
+def _group(found: dict[str, Feature]) -> dict[str, list[Feature]]:
+    """Which factor each column belongs to. `s` is what LeRobot calls the robot's and the environment's state: a label
+    of the episode under another name must never slip into it, for no environment reports one."""
+    states = [found[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in found]
+    if not states:
+        raise ValueError(f"The dataset has no {OBS_STATE!r}: UniMASK models states and actions. It has {list(found)}.")
+    if ACTION not in found:
+        raise ValueError(f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}.")
+    features = {"s": states, "a": [found[ACTION]]}
+    if RETURN_TO_GO in found:
+        features["rtg"] = [found[RETURN_TO_GO]]
+    return features
+
+
+def _describe(features: dict[str, list[Feature]]) -> str:
+    kinds = (
+        f"{name} = {f.key} ({f.size} numbers{f', categories {f.categories}' if f.categories else ''})"
+        for name, columns in features.items()
+        for f in columns
+    )
+    return "; ".join(kinds)

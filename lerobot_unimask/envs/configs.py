@@ -1,0 +1,78 @@
+"""LeRobot's `--env.type=...` for this package's environments.
+
+One environment is one `EnvConfig` of a few lines: its `task`, which with the package's name is the gymnasium id, its
+`fps`, and the shapes of what it takes and gives.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+
+def state_and_action(state: int, action: int) -> dict[str, PolicyFeature]:
+    """The features of an environment that observes `state` numbers, and the return so far, and takes `action`."""
+    return {
+        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(action,)),
+        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(state,)),
+        "return_so_far": PolicyFeature(type=FeatureType.STATE, shape=(1,)),
+    }
+
+
+@dataclass
+class UniMASKEnvConfig(EnvConfig):
+    """What the environments of this package share: names in LeRobot, and synchronous stepping."""
+
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "return_so_far": "observation.return_so_far",
+        }
+    )
+
+    @property
+    def package_name(self) -> str:
+        """The gymnasium namespace, and the package whose import registers the ids."""
+        return "lerobot_unimask"
+
+    @property
+    def gym_kwargs(self) -> Mapping[str, Any]:
+        return {"render_mode": "rgb_array"}
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """{type: {0: SyncVectorEnv of `n_envs`}}, synchronous whatever `use_async_envs` says.
+
+        Asynchronous ones, LeRobot's default, import torch in every worker: a minute or more and half a gigabyte each,
+        for environments that step in well under a millisecond.
+        """
+        return super().create_envs(n_envs, use_async_envs=False)
+
+
+@EnvConfig.register_subclass("doorkey")
+@dataclass
+class DoorKeyEnvConfig(UniMASKEnvConfig):
+    """`--env.type=doorkey`"""
+
+    task: str | None = "DoorKey-v0"
+    fps: int = 10
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=2, action=1))
+
+
+@EnvConfig.register_subclass("maze2d")
+@dataclass
+class Maze2DEnvConfig(UniMASKEnvConfig):
+    """`--env.type=maze2d`"""
+
+    task: str | None = "Maze2D-v0"
+    fps: int = 100
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=4, action=2))
+    maze: str = "medium"  # umaze, medium, large, or a maze's text (see `envs/maze2d.py`)
+
+    @property
+    def gym_kwargs(self) -> Mapping[str, Any]:
+        return {**super().gym_kwargs, "maze": self.maze}

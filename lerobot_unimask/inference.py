@@ -1,0 +1,301 @@
+"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+
+Acting is a question asked at every step, so everything here goes through `predict`; there is no second path.
+
+Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lerobot_unimask.masks import ASKABLE, Mask, parse_token
+from lerobot_unimask.window import Component, Factor, Statistics, Window
+
+ORDERS = ("forward", "backward", "random")
+Network = Callable[[Window, dict[str, Tensor]], dict[str, list[Tensor]]]
+Given = Mapping[str, Any]  # token text -> its value, shared (D,) or one per environment (B, D); a number where D = 1
+
+
+@dataclass
+class Distribution:
+    """The answer about one component at every step, in the dataset's units.
+
+    Where the token was shown: the shown value, with certainty. Where it was neither shown nor asked for: NaN.
+    """
+
+    component: Component
+    probabilities: Tensor | None  # (B, K, categories), of a discrete component
+    mean: Tensor | None  # (B, K, d), of a continuous one
+
+    @property
+    def name(self) -> str:
+        return self.component.name
+
+    @property
+    def most_likely(self) -> Tensor:
+        """(B, K, d): the category of the highest probability, or the mean."""
+        if self.probabilities is None:
+            return self.mean
+        best = self.probabilities.nan_to_num(-1.0).argmax(-1, keepdim=True).to(self.probabilities.dtype)
+        return torch.where(self.probabilities.isnan().any(-1, keepdim=True), torch.nan, best)
+
+    def draw(self, generator: torch.Generator | None) -> Tensor:
+        """One sample for each step, (B, K, d). The L2 head has no spread: of a continuous component it is the mean."""
+        if self.probabilities is None:
+            return self.mean
+        certain = functional.one_hot(torch.zeros_like(self.probabilities[..., 0], dtype=torch.long), self.component.size)
+        weights = torch.where(self.probabilities.isnan(), certain.to(self.probabilities.dtype), self.probabilities)
+        drawn = torch.multinomial(weights.flatten(0, 1), 1, generator=generator)
+        return drawn.view(*self.probabilities.shape[:2], 1).to(self.probabilities.dtype)
+
+
+@dataclass
+class Answer:
+    """What a policy answers to one mask: `answer["a"][0].probabilities` is (B, K, categories)."""
+
+    mask: Mask
+    distributions: dict[str, list[Distribution]]
+
+    def __getitem__(self, factor: str) -> list[Distribution]:
+        """One distribution for each component of `s` or `a`, in the order in which the dataset stores them."""
+        return self.distributions[factor]
+
+    def most_likely(self, factor: str) -> Tensor:
+        """(B, K, D): shown values as they are, the most likely ones where asked, NaN elsewhere."""
+        return torch.cat([distribution.most_likely for distribution in self.distributions[factor]], dim=-1)
+
+
+def answer(
+    network: Network, statistics: Statistics, factors: Mapping[str, Factor], window: Window, mask: Mask
+) -> Answer:
+    """The distribution of every asked-for token given the shown ones."""
+    predictions = network(statistics.normalise(window), mask.visible)
+    distributions = {}
+    for name, outputs in predictions.items():
+        shown = mask.visible[name].unsqueeze(-1)
+        known = shown | mask.predict[name].unsqueeze(-1)  # (B, K, 1)
+        distributions[name] = []
+        for output, component in zip(outputs, factors[name].components, strict=True):
+            value = window.values[name][..., component.dims]
+            if component.discrete:
+                certain = torch.where(shown, value, 0.0).squeeze(-1).long()
+                certain = functional.one_hot(certain, component.categories).to(output.dtype)
+                probabilities = torch.where(shown, certain, output.softmax(-1))
+                probabilities = torch.where(known, probabilities, torch.nan)
+                distributions[name].append(Distribution(component, probabilities, None))
+            else:
+                mean = torch.where(shown, value, statistics.denormalise(name, component, output))
+                distributions[name].append(Distribution(component, None, torch.where(known, mean, torch.nan)))
+    return Answer(mask, distributions)
+
+
+def sample(
+    network: Network,
+    statistics: Statistics,
+    factors: Mapping[str, Factor],
+    window: Window,
+    mask: Mask,
+    *,
+    order: str,
+    generator: torch.Generator,
+) -> Window:
+    """Draw the asked-for tokens one after another, each given the shown ones and those already drawn (chain rule).
+
+    A token's own components (agent and key, say) are drawn side by side from their marginals.
+
+    Args:
+        order: `forward` in time (s0, a0, s1, ...), `backward`, or `random` (one order for the whole batch).
+
+    Returns:
+        The window with shown and drawn values, NaN elsewhere.
+
+    Raises:
+        ValueError: an unknown order.
+    """
+    if order not in ORDERS:
+        raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
+    asked = torch.stack([mask.predict[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
+    tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
+    if order == "backward":
+        tokens.reverse()
+    elif order == "random":
+        shuffle = torch.randperm(len(tokens), generator=generator, device=generator.device).tolist()
+        tokens = [tokens[i] for i in shuffle]
+    visible = {name: shown.clone() for name, shown in mask.visible.items()}
+    values = {
+        name: torch.where(visible[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()
+    }
+    drawn = Window(values, window.valid)
+    for name, step in tokens:
+        here = torch.zeros_like(mask.predict[name])
+        here[:, step] = mask.predict[name][:, step]
+        nothing = {other: torch.zeros_like(here) for other in mask.predict}
+        step_answer = answer(network, statistics, factors, drawn, Mask(visible, nothing | {name: here}))
+        value = torch.cat([distribution.draw(generator) for distribution in step_answer[name]], dim=-1)
+        values[name] = torch.where(here.unsqueeze(-1), value, values[name])
+        visible[name] = visible[name] | here
+    return drawn
+
+
+# --- Values that a user gives ----------------------------------------------------------------------------------------
+
+
+def read_given(
+    given: Given, factors: Mapping[str, Factor], context_length: int, batch_size: int
+) -> dict[tuple[str, int], Tensor]:
+    """Check what a user gives: (factor, position) -> (B, D) or (1, D), D as the user counts it, without computed parts.
+
+    Raises:
+        MaskError: a key that is not a token of the window.
+        ValueError: a value of the wrong size, not finite, or not one of the categories.
+    """
+    tokens = {}
+    for text, value in given.items():
+        name, step = parse_token(text, tuple(factors), context_length)
+        tokens[name, step] = _token(text, value, factors[name], batch_size)
+    return tokens
+
+
+def give(
+    window: Window, tokens: Mapping[tuple[str, int], Tensor], known: Mapping[str, Tensor]
+) -> tuple[Window, dict[str, Tensor]]:
+    """The window with the given tokens where nothing has been observed, and which tokens are known then.
+
+    Args:
+        tokens: as `read_given` returns them.
+        known: factor -> (K,) bool, True where the window holds an observed value, which wins over a given one.
+    """
+    values, known = dict(window.values), dict(known)
+    for (name, step), value in tokens.items():
+        if not known[name][step]:
+            values[name], known[name] = values[name].clone(), known[name].clone()
+            values[name][:, step, : value.shape[-1]] = value.to(window.valid.device)
+            known[name][step] = True
+    return Window(values, window.valid), known
+
+
+def _token(text: str, value: Any, factor: Factor, B: int) -> Tensor:
+    """(B, given_size) or (1, given_size), checked."""
+    size = factor.given_size
+    try:
+        token = torch.as_tensor(value, dtype=torch.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}.") from error
+    if token.ndim == 0 or (token.ndim == 1 and size == 1 and token.shape[0] == B):
+        token = token.reshape(-1, 1)
+    elif token.ndim == 1:
+        token = token.unsqueeze(0)
+    if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B):
+        raise ValueError(
+            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or one such row for each of the {B} "
+            "environments."
+        )
+    if not token.isfinite().all():
+        raise ValueError(f"{text} is given {value!r}; its numbers must be finite.")
+    for component in factor.components:
+        if component.discrete:
+            numbers = token[:, component.dims]
+            if ((numbers < 0) | (numbers >= component.categories) | (numbers != numbers.round())).any():
+                raise ValueError(
+                    f"{text} is given {value!r}; {component.name} is a category from 0 to {component.categories - 1}."
+                )
+    return token
+
+
+def check_known(mask: Mask, known: Mapping[str, Tensor], text: str) -> None:
+    """Everything that the mask shows must be known.
+
+    Raises:
+        ValueError: it shows a token that has been neither observed nor given.
+    """
+    missing = [
+        f"{name}[{step}]"
+        for name, shown in mask.visible.items()
+        for step in (shown.any(0) & ~known[name]).nonzero().flatten().tolist()
+    ]
+    if missing:
+        example = missing[0]
+        raise ValueError(
+            f"The mask shows {', '.join(missing)}, which has been neither observed nor given.\n  {text}\n"
+            f'Give its value, as in given={{"{example}": ...}}, or choose a mask that does not show it.'
+        )
+
+
+# --- Acting ------------------------------------------------------------------------------------------------------------
+
+
+class RolloutMemory:
+    """The last K states and actions of each environment in a batch, and the return each had received by then.
+
+    The present stands at position min(step, K - 1): before the window is full later positions are empty, then it slides.
+    """
+
+    def __init__(self, factors: Mapping[str, Factor], context_length: int, batch_size: int, device: torch.device):
+        K = context_length
+        self.step = -1  # of the episode; nothing has been observed yet
+        self.values = {
+            name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()
+        }
+        self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
+        self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
+
+    @property
+    def position(self) -> int:
+        """Where the present stands in the window."""
+        return min(self.step, self.valid.shape[1] - 1)
+
+    @property
+    def first_step(self) -> int:
+        """The episode's step at position 0."""
+        return self.step - self.position
+
+    def observe(self, state: Tensor, return_so_far: Tensor | None) -> None:
+        """Begin a step: (B, D) of `s`, and (B,) the rewards received so far, where the environment reports them."""
+        K = self.valid.shape[1]
+        self.step += 1
+        if self.step >= K:
+            for name in ASKABLE:
+                self.values[name] = self.values[name].roll(-1, dims=1)
+            self.return_so_far = self.return_so_far.roll(-1, dims=1)
+        self.values["s"][:, self.position] = state
+        self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
+
+    def act(self, action: Tensor) -> None:
+        """End the step: (B, D) of `a`."""
+        self.values["a"][:, self.position] = action
+
+    def known(self) -> dict[str, Tensor]:
+        """factor -> (K,) bool: states up to the present, actions before it."""
+        steps = torch.arange(self.valid.shape[1])
+        before = {"s": steps <= self.position, "a": steps < self.position}
+        return {name: before.get(name, torch.zeros_like(steps, dtype=torch.bool)) for name in self.values}
+
+    def window(self, horizon: Tensor) -> Window:
+        """The window as it stands; the return token knows its timestep, its return is for `give` to fill in."""
+        values = dict(self.values)
+        if "rtg" in values:
+            values["rtg"] = values["rtg"].clone()
+            values["rtg"][:, 0, -1] = self.first_step / horizon
+        return Window(values, self.valid)
+
+    def remaining(self, target_return: Tensor) -> Tensor:
+        """What is left of the target return at the window's first step, (B, 1).
+
+        Raises:
+            ValueError: the window has slid and the environment never reported the return so far.
+        """
+        if self.first_step == 0:
+            return target_return.expand(len(self.valid), 1)
+        received = self.return_so_far[:, :1]
+        if received.isnan().any():
+            raise ValueError(
+                "Asking for a return needs the environment to report what it has paid so far, as "
+                "'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
+            )
+        return target_return - received
+

@@ -1,0 +1,45 @@
+"""What a prediction costs, over the asked-for tokens alone.
+
+Legend of shapes: B windows, K steps, D the dimensions of a factor.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lerobot_unimask.window import Component, Factor, Window
+
+
+def component_loss(prediction: Tensor, value: Tensor, component: Component) -> Tensor:
+    """What one component costs at every step, (B, K): cross-entropy in nats, or the squared error's mean over the
+    component's dimensions, in units of their standard deviations."""
+    target = value[..., component.dims]
+    if component.discrete:
+        return functional.cross_entropy(prediction.transpose(1, 2), target.squeeze(-1).long(), reduction="none")
+    return (prediction - target).square().mean(-1)
+
+
+def masked_losses(
+    predictions: dict[str, list[Tensor]], window: Window, predict: dict[str, Tensor], factors: dict[str, Factor]
+) -> dict[str, Tensor]:
+    """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up.
+
+    Args:
+        predictions: factor -> one (B, K, size) per component, as a network puts them out.
+        window: the recorded values, normalised.
+        predict: factor -> (B, K) bool, True = asked for; never a step outside the episode.
+
+    Returns:
+        factor -> scalar; 0 where nothing of the factor is asked.
+    """
+    losses = {}
+    for name, outputs in predictions.items():
+        asked = predict[name]
+        # Replaced where not asked: past the end of an episode anything may stand, even no number at all.
+        value = torch.where(asked.unsqueeze(-1), window.values[name], 0.0)
+        count = asked.sum().clamp_min(1)
+        losses[name] = sum(
+            (component_loss(output, value, component) * asked).sum() / count
+            for output, component in zip(outputs, factors[name].components, strict=True)
+        )
+    return losses

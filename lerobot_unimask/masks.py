@@ -1,0 +1,515 @@
+"""The mask language, the table of named tasks, and drawing masks for a batch.
+
+A question is written in the paper's own notation, P(what is asked | what is shown), over a window of K steps:
+`a[t] | s[:t+1], a[:t]` is behaviour cloning. Here such a text becomes a boolean table with one row for each t that it
+admits; a mask for a batch is a choice of rows. A mask is boolean and True means: the model may see it.
+
+Legend of shapes: B windows, K steps, F factors, R rows (one for each admissible t of each task).
+"""
+
+import difflib
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+# Paper, appendix "Training regimes". The names are the columns of the published heatmap. The waypoints are its steps
+# 0, K//3, 2K//3 and K-1 for K = 10; inverse dynamics is the paper's definition (recover the previous state).
+TASKS: dict[str, str] = {
+    "behavior_cloning": "a[t] | s[:t+1], a[:t]",
+    "reward_conditioned": "a[t] | s[:t+1], a[:t], rtg[0]",
+    "goal_conditioned": "a[t] | s[:t+1], a[:t], s[-1]",
+    "waypoint_conditioned": "a[t] | s[:t+1], a[:t], s[::3]",
+    "past": "s[:t], a[:t] | s[t:], a[t:]",
+    "future": "s[t+1:], a[t:] | s[:t+1], a[:t]",
+    "forward_dynamics": "s[t+1] | s[t], a[t]",
+    "inverse_dynamics": "s[t-1] | s[t], a[t-1]",
+}
+RANDOM_MASK = "random_mask"  # not a question: each window draws how much of it is hidden, and where
+REGIMES: dict[str, tuple[str, ...]] = {"multi_task": tuple(TASKS)}
+
+ASKABLE = ("s", "a")  # every other factor is a property: shown at step 0 or not at all, never asked
+MAX_TEXT = 1000  # characters
+MAX_CONTEXT = 1024  # steps
+
+
+class MaskError(ValueError):
+    """A mask text that does not parse or asks for what does not exist; shows the text with a caret under the fault."""
+
+    def __init__(self, message: str, text: str, position: int | None = None):
+        line = re.sub(r"\s", " ", text)  # one line, so that the caret stands where it should
+        caret = f"\n  {' ' * position}^" if position is not None else ""
+        super().__init__(f"{message}\n  {line}{caret}")
+
+
+# --- The language --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Index:
+    """One step: `3`, `-1`, or with `relative` an offset from t: `t+1`."""
+
+    value: int
+    relative: bool
+    position: int  # of its first character in the text
+
+
+@dataclass(frozen=True)
+class Slice:
+    """`start:stop:step`, each part optional."""
+
+    start: Index | None
+    stop: Index | None
+    step: int
+
+
+@dataclass(frozen=True)
+class Term:
+    """`factor[steps, ...]`."""
+
+    factor: str
+    steps: tuple[Index | Slice, ...]
+    position: int
+
+
+@dataclass(frozen=True)
+class Question:
+    """The parsed form of `asked | shown`."""
+
+    text: str
+    asked: tuple[Term, ...]
+    shown: tuple[Term, ...]
+
+    @property
+    def uses_t(self) -> bool:
+        steps = [step for term in self.asked + self.shown for step in term.steps]
+        bounds = [b for s in steps for b in ((s.start, s.stop) if isinstance(s, Slice) else (s,)) if b is not None]
+        return any(bound.relative for bound in bounds)
+
+
+_TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<integer>\d+)|(?P<symbol>[\[\]:,+\-|]))")
+
+
+class _Parser:
+    """Recursive descent over `terms | terms`; nothing of the text is ever evaluated."""
+
+    def __init__(self, text: str):
+        self.text = text
+        self.tokens: list[tuple[str, str, int]] = []  # (kind, text, position)
+        end = len(text.rstrip())
+        at = 0
+        while at < end:
+            match = _TOKEN.match(text, at)
+            if match is None:
+                at += len(text[at:]) - len(text[at:].lstrip())
+                raise MaskError(
+                    f"Unexpected character {text[at]!r}; a mask text looks like 'a[t] | s[:t+1], a[:t]'.", text, at
+                )
+            kind = match.lastgroup
+            self.tokens.append((kind, match[kind], match.start(kind)))
+            at = match.end()
+        self.tokens.append(("end", "", end))
+        self.next = 0
+
+    def fail(self, expected: str):
+        kind, token, position = self.tokens[self.next]
+        found = "the end of the text" if kind == "end" else repr(token)
+        raise MaskError(f"Expected {expected}, found {found}.", self.text, position)
+
+    def accept(self, *symbols: str) -> str | None:
+        token = self.tokens[self.next][1]
+        if token in symbols:
+            self.next += 1
+            return token
+        return None
+
+    def question(self) -> Question:
+        asked = self.terms()
+        shown = ()
+        if self.accept("|") and self.tokens[self.next][0] != "end":
+            shown = self.terms()
+        if self.tokens[self.next][0] != "end":
+            self.fail("',' or the end of the text" if shown else "',' or '|'")
+        return Question(self.text, asked, shown)
+
+    def terms(self) -> tuple[Term, ...]:
+        terms = [self.term()]
+        while self.accept(","):
+            terms.append(self.term())
+        return tuple(terms)
+
+    def term(self) -> Term:
+        kind, name, position = self.tokens[self.next]
+        if kind != "name":
+            self.fail("a factor such as s or a")
+        if name == "t":
+            raise MaskError("'t' is the step, not a factor: write a[t] or s[t].", self.text, position)
+        self.next += 1
+        if not self.accept("["):
+            self.fail(f"'[' after {name}: factors are always indexed, as in {name}[0]")
+        steps = [self.steps()]
+        while self.accept(","):
+            steps.append(self.steps())
+        if not self.accept("]"):
+            self.fail("',' or ']'")
+        return Term(name, tuple(steps), position)
+
+    def steps(self) -> Index | Slice:
+        start = self.index()
+        if not self.accept(":"):
+            return start if start is not None else self.fail("a step: an integer, t, t+1, t-1 or a slice")
+        stop = self.index()
+        step = 1
+        if self.accept(":"):
+            position = self.tokens[self.next][2]
+            index = self.index()
+            if index is not None:
+                if index.relative or index.value < 1:
+                    raise MaskError("A slice's step is a positive integer.", self.text, position)
+                step = index.value
+        return Slice(start, stop, step)
+
+    def index(self) -> Index | None:
+        kind, token, position = self.tokens[self.next]
+        if token == "t":
+            self.next += 1
+            sign = self.accept("+", "-")
+            return Index(self.integer(sign) if sign else 0, True, position)
+        if token == "-" or kind == "integer":
+            return Index(self.integer(self.accept("-") or "+"), False, position)
+        return None
+
+    def integer(self, sign: str) -> int:
+        kind, token, position = self.tokens[self.next]
+        if kind != "integer":
+            self.fail("an integer")
+        if len(token) > 6:
+            raise MaskError(f"A window has at most {MAX_CONTEXT} steps.", self.text, position)
+        self.next += 1
+        return -int(token) if sign == "-" else int(token)
+
+
+def parse_token(text: str, factors: Sequence[str], context_length: int) -> tuple[str, int]:
+    """The factor and window position of a single token, such as `s[-1]`: ("s", K - 1).
+
+    Raises:
+        MaskError: it is not one token of this model's window.
+    """
+    terms = _Parser(text).terms()
+    steps = [step for term in terms for step in term.steps]
+    if len(steps) != 1 or not isinstance(steps[0], Index) or steps[0].relative:
+        raise MaskError("A value is given to a single token, such as s[-1] or rtg[0].", text, 0)
+    _check_factors(terms, factors, text)
+    chosen = _select(terms, factors, context_length, -1, text)
+    return terms[0].factor, int(chosen.any(0).int().argmax())
+
+
+def parse(text: str) -> Question:
+    """Parse one mask text or the name of a task in `TASKS`.
+
+    Raises:
+        MaskError: the text does not parse; shows it with a caret under the fault.
+    """
+    if not isinstance(text, str):
+        raise TypeError(f"A mask is written as text, such as 'a[t] | s[:t+1], a[:t]'; got {type(text).__name__}.")
+    if len(text) > MAX_TEXT:
+        raise MaskError(f"A mask text has at most {MAX_TEXT} characters, this one has {len(text)}.", text[:60] + " ...")
+    name = text.strip()
+    if re.fullmatch(r"\w+", name):
+        if name not in TASKS:
+            near = difflib.get_close_matches(name, [*TASKS, RANDOM_MASK, *REGIMES], n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise MaskError(
+                f"No task is named {name!r}.{hint} Named tasks: {', '.join(TASKS)}. "
+                "Any other question is written out, as in 's[1:9] | s[0], s[3]'.",
+                text,
+                text.index(name),
+            )
+        text = TASKS[name]
+    return _Parser(text).question()
+
+
+# --- From a text to rows ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MaskTable:
+    """Every mask that one question stands for: row r is the mask at t = `t[r]`.
+
+    `visible` and `predict` are (R, F, K) booleans, `t` is (R,) int64; a question without t has one row, with t = -1.
+    """
+
+    question: Question
+    factors: tuple[str, ...]
+    visible: Tensor
+    predict: Tensor
+    t: Tensor
+
+    def at(self, t: int | None, batch_size: int = 1) -> "Mask":
+        """The mask at step t for each window of a batch.
+
+        Raises:
+            MaskError: the question has a t and none is given, or it does not admit this one.
+        """
+        if not self.question.uses_t:
+            row = 0
+        elif t is None:
+            raise MaskError("The question is about a step t: say which, as in t=3.", self.question.text)
+        elif int(t) not in self.t.tolist():
+            admitted = ", ".join(map(str, self.t.tolist()))
+            raise MaskError(f"The question cannot be asked at t={int(t)}; it can at t = {admitted}.", self.question.text)
+        else:
+            row = self.t.tolist().index(int(t))
+        shape = (batch_size, self.visible.shape[-1])
+        return Mask(
+            {name: self.visible[row, f].expand(shape) for f, name in enumerate(self.factors)},
+            {name: self.predict[row, f].expand(shape) for f, name in enumerate(self.factors)},
+        )
+
+
+@functools.lru_cache(maxsize=256)
+def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTable:
+    """Work out, for every t that `text` admits, which tokens of a window are shown and which are asked for.
+
+    Args:
+        text: a question or the name of a task.
+        factors: the model's factors, `s` and `a` first; the others are properties.
+        context_length: K.
+
+    Raises:
+        MaskError: unknown factor, a step outside the window, a property asked for or shown after step 0, nothing asked.
+    """
+    question = parse(text)
+    text = question.text
+    _check_factors(question.asked + question.shown, factors, text)
+    for term in question.asked:
+        if term.factor not in ASKABLE:
+            raise MaskError(f"{term.factor} can be shown but never asked; ask for s or a.", text, term.position)
+    rows: list[tuple[int, Tensor, Tensor]] = []
+    for t in range(context_length) if question.uses_t else (-1,):
+        predict = _select(question.asked, factors, context_length, t, text)
+        visible = _select(question.shown, factors, context_length, t, text)
+        if predict is None or visible is None:
+            continue  # an integer index falls outside the window at this t
+        predict &= ~visible  # what is shown is not asked
+        if predict.any():
+            rows.append((t, visible, predict))
+    if not rows:
+        where = f" for any t in a window of {context_length} steps" if question.uses_t else ""
+        raise MaskError(f"Nothing is asked that is not shown{where}.", text, question.asked[0].position)
+    return MaskTable(
+        question,
+        tuple(factors),
+        visible=torch.stack([visible for _, visible, _ in rows]),
+        predict=torch.stack([predict for _, _, predict in rows]),
+        t=torch.tensor([t for t, _, _ in rows]),
+    )
+
+
+def _check_factors(terms: Sequence[Term], factors: Sequence[str], text: str) -> None:
+    for term in terms:
+        if term.factor not in factors:
+            near = difflib.get_close_matches(term.factor, factors, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            known = ", ".join(factors)
+            raise MaskError(
+                f"This model has no factor {term.factor!r}.{hint} Its factors are {known}.", text, term.position
+            )
+
+
+def _select(terms: Sequence[Term], factors: Sequence[str], K: int, t: int, text: str) -> Tensor | None:
+    """The tokens that `terms` name at this t, (F, K) bool; None where an integer rules this t out."""
+    chosen = torch.zeros(len(factors), K, dtype=torch.bool)
+    for term in terms:
+        for part in term.steps:
+            if isinstance(part, Slice):
+                bounds = slice(_bound(part.start, K, t), _bound(part.stop, K, t), part.step)
+                steps = range(*bounds.indices(K))
+            else:
+                step = part.value + t if part.relative else part.value
+                if part.relative and not 0 <= step < K:
+                    return None
+                if not -K <= step < K:
+                    raise MaskError(
+                        f"Step {step} lies outside the window: its steps are 0 to {K - 1} (or -{K} to -1).",
+                        text,
+                        part.position,
+                    )
+                steps = (step % K,)
+            if term.factor not in ASKABLE and any(steps):
+                raise MaskError(
+                    f"{term.factor} can be shown at step 0 only: write {term.factor}[0].", text, term.position
+                )
+            chosen[factors.index(term.factor), list(steps)] = True
+    return chosen
+
+
+def _bound(index: Index | None, K: int, t: int) -> int | None:
+    """A slice's bound. With t it is clipped to the window and never wraps; without, it is Python's."""
+    if index is None or not index.relative:
+        return index.value if index else None
+    return min(max(index.value + t, 0), K)
+
+
+# --- Masks for a batch ------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Mask:
+    """Which tokens of a batch of windows the model may see and which it is asked for.
+
+    Two dicts of factor -> (B, K) bool; True in `visible` means shown, True in `predict` means asked. Goal-conditioned
+    imitation at t = 2 in a window of six steps, `#` shown, `?` asked, `.` neither:
+
+        s ###..#  a ##?...
+    """
+
+    visible: dict[str, Tensor]
+    predict: dict[str, Tensor]
+
+    def within(self, valid: Tensor) -> "Mask":
+        """The same mask with steps outside the episode, `valid` (B, K) False, neither shown nor asked."""
+        visible = {name: shown & valid for name, shown in self.visible.items()}
+        predict = {name: asked & valid for name, asked in self.predict.items()}
+        return Mask(visible, predict)
+
+    def to(self, device: torch.device) -> "Mask":
+        return Mask(
+            {name: shown.to(device) for name, shown in self.visible.items()},
+            {name: asked.to(device) for name, asked in self.predict.items()},
+        )
+
+    def draw(self, window: int = 0) -> str:
+        """One window's mask as text, in the notation of the class's docstring."""
+        rows = []
+        for name, shown in self.visible.items():
+            marks = zip(shown[window].tolist(), self.predict[name][window].tolist(), strict=True)
+            rows.append(f"{name} " + "".join("#" if s else "?" if p else "." for s, p in marks))
+        return "  ".join(rows)
+
+
+class TrainingMasks(nn.Module):
+    """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
+
+    Args:
+        masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
+            of a task, `random_mask`, or a regime's name (`multi_task`: the eight tasks, sharing its weight).
+        factors: the model's factors.
+        context_length: K.
+
+    Raises:
+        MaskError: a text that does not fit the model.
+        ValueError: no masks, or weights that are not positive numbers.
+    """
+
+    def __init__(self, masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[str], context_length: int):
+        super().__init__()
+        self.factors = tuple(factors)
+        self.weights = mixture(masks)
+        tables = [tabulate(text, self.factors, context_length) for text in self.weights if text != RANDOM_MASK]
+        tasks = [task for task, text in enumerate(self.weights) if text != RANDOM_MASK]
+        self.random_task = list(self.weights).index(RANDOM_MASK) if RANDOM_MASK in self.weights else None
+        empty = torch.zeros(0, len(self.factors), context_length, dtype=torch.bool)
+        weights = torch.tensor(list(self.weights.values()), dtype=torch.float64)
+        # Worked out from the config, so not part of the checkpoint.
+        self.register_buffer("visible", torch.cat([empty, *(table.visible for table in tables)]), persistent=False)
+        self.register_buffer("predict", torch.cat([empty, *(table.predict for table in tables)]), persistent=False)
+        task_of_row = [task for task, table in zip(tasks, tables, strict=True) for _ in table.t]
+        self.register_buffer("task_of_row", torch.tensor(task_of_row, dtype=torch.int64), persistent=False)
+        shares = (weights / weights.sum()).cumsum(0)[:-1].float()
+        self.register_buffer("cumulative_weights", shares, persistent=False)
+
+    def forward(self, valid: Tensor, index: Tensor, *, seed: int, step: Tensor | int) -> Mask:
+        """Draw a mask for each window.
+
+        Args:
+            valid: (B, K) bool, False past the episode's end.
+            index: (B,) the windows' first frames. Together with `seed` and `step` it decides the mask, so that masks
+                do not depend on workers, on how a batch is split over processes, or on a restart.
+            step: how many updates have been made.
+        """
+        B, K = valid.shape
+        F = len(self.factors)
+        uniform = counter_uniform(seed, step, index, 3 + F * K)  # (B, 3 + F K)
+        task = torch.searchsorted(self.cumulative_weights, uniform[:, 0].contiguous(), right=True)  # (B,)
+        visible = valid.new_zeros(B, F, K)
+        predict = valid.new_zeros(B, F, K)
+        if len(self.visible):
+            visible, predict = self._question_masks(valid, task, uniform[:, 1])
+        if self.random_task is not None:
+            chosen = (task == self.random_task)[:, None, None]
+            hidden = self._hidden(uniform[:, 2], uniform[:, 3:].view(B, F, K))
+            askable = torch.tensor([name in ASKABLE for name in self.factors], device=valid.device)[:, None]
+            visible = torch.where(chosen, ~hidden, visible)
+            predict = torch.where(chosen, hidden & askable, predict)
+        visible, predict = visible.unbind(1), predict.unbind(1)
+        mask = Mask(dict(zip(self.factors, visible, strict=True)), dict(zip(self.factors, predict, strict=True)))
+        return mask.within(valid)
+
+    def _question_masks(self, valid: Tensor, task: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """One row per window, uniform among those of its task that ask for something valid: two (B, F, K)."""
+        asked = self.predict.any(1)  # (R, K)
+        admissible = (valid.float() @ asked.T.float() > 0) & (self.task_of_row == task[:, None])  # (B, R)
+        rank = admissible.cumsum(1)
+        wanted = (uniform * rank[:, -1]).floor() + 1  # 1 .. number of admissible rows
+        row = (admissible & (rank == wanted[:, None])).int().argmax(1)  # (B,)
+        some = admissible.any(1)[:, None, None]
+        return self.visible[row] & some, self.predict[row] & some
+
+    def _hidden(self, probability: Tensor, uniform: Tensor) -> Tensor:
+        """Random masking (paper, section 2.2 and appendix C): p ~ U(0, 1) per window, each state and action hidden
+        with probability p; a property's first token hidden with probability 1/2, its later ones always. (B, F, K)."""
+        hidden = uniform < probability[:, None, None]
+        for f, name in enumerate(self.factors):
+            if name not in ASKABLE:
+                hidden[:, f, 0] = uniform[:, f, 0] < 0.5
+                hidden[:, f, 1:] = True
+        return hidden
+
+
+def mixture(masks: str | Sequence[str] | Mapping[str, float]) -> dict[str, float]:
+    """`training_masks` as one mapping from texts to weights, regimes expanded.
+
+    Raises:
+        ValueError: nothing given, or weights that are not positive numbers.
+    """
+    if isinstance(masks, str):
+        masks = [masks]
+    weights = dict(masks) if isinstance(masks, Mapping) else {text: 1.0 for text in masks}
+    if not weights:
+        raise ValueError(f"training_masks is empty; name a question or a task: {', '.join([*TASKS, RANDOM_MASK])}.")
+    expanded: dict[str, float] = {}
+    for text, weight in weights.items():
+        if not isinstance(weight, int | float) or not 0 < weight < float("inf"):
+            raise ValueError(f"training_masks gives {text!r} the weight {weight!r}; weights are positive numbers.")
+        members = REGIMES.get(text, (text,))
+        for member in members:
+            expanded[member] = expanded.get(member, 0.0) + weight / len(members)
+    return expanded
+
+
+def counter_uniform(seed: int, step: Tensor | int, index: Tensor, n: int) -> Tensor:
+    """n uniform numbers in [0, 1) for each entry of `index` (B,), a pure function of (seed, step, index): (B, n) float32.
+
+    SplitMix64's finaliser (Steele, Lea and Flood, 2014) as a counter-based hash.
+    """
+    golden = -0x61C8864680B583EB  # 2^64 / golden ratio, as a signed integer
+    index = index.to(torch.int64)
+    key = _mix64(_mix64(torch.full_like(index, seed) * golden) + step)
+    lanes = torch.arange(1, n + 1, device=index.device) * golden
+    bits = _mix64(_mix64(key ^ (index * golden))[:, None] + lanes)  # (B, n)
+    return _shift_right(bits, 40).float() * 2.0**-24
+
+
+def _mix64(x: Tensor) -> Tensor:
+    x = (x ^ _shift_right(x, 30)) * -0x40A7B892E31B1A47
+    x = (x ^ _shift_right(x, 27)) * -0x6B2FB644ECCEEE15
+    return x ^ _shift_right(x, 31)
+
+
+def _shift_right(x: Tensor, bits: int) -> Tensor:
+    """A logical shift: torch has signed 64-bit integers alone, whose shift copies the sign."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)

@@ -1,0 +1,368 @@
+"""UniMASKPolicy: the masked model behind LeRobot's policy contract, and the questions that one can ask it."""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from lerobot_unimask import inference
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.inference import Answer, Given, RolloutMemory
+from lerobot_unimask.losses import masked_losses
+from lerobot_unimask.masks import Mask, MaskError, MaskTable, TrainingMasks, tabulate
+from lerobot_unimask.networks.transformer import Transformer
+from lerobot_unimask.window import RETURN_SO_FAR, Statistics, Window, make_factors, make_window
+
+logger = logging.getLogger(__name__)
+
+# The update count of training masks is never negative, so validation draws masks that no update has seen, and at every
+# validation the same ones.
+VALIDATION_STEP = -1
+
+
+class UniMASKPolicy(PreTrainedPolicy):
+    """One masked transformer over windows of states, actions and returns (Carroll et al., NeurIPS 2022).
+
+    Args:
+        config: with `features` read off a dataset, or LeRobot's input and output features.
+        dataset_stats: statistics to normalise with, `LeRobotDatasetMetadata.stats`; without them nothing is scaled
+            until a checkpoint is loaded.
+
+    Raises:
+        ValueError: the dataset lacks states or actions, or the settings ask for a factor that it does not have.
+        MaskError: a training mask or the inference mask that does not fit the model's factors and window.
+    """
+
+    config_class = UniMASKConfig
+    name = "unimask"
+
+    def __init__(
+        self, config: UniMASKConfig, dataset_stats: Mapping[str, Mapping[str, Any]] | None = None, **_: Any
+    ) -> None:
+        super().__init__(config)
+        config.validate_features()
+        if config.image_features:
+            logger.warning(
+                "unimask ignores the camera features %s; LeRobot decodes them all the same.",
+                ", ".join(config.image_features),
+            )
+        self.factors = make_factors(config.features)
+        self._check_settings()
+        self.statistics = Statistics(config.features, self.factors, config.context_length)
+        if dataset_stats is not None:
+            self.statistics.fill(dataset_stats)
+        self.training_masks = TrainingMasks(config.training_masks, tuple(self.factors), config.context_length)
+        self.network = Transformer(
+            self.factors,
+            context_length=config.context_length,
+            stacked=config.token_layout == "stacked",
+            width=config.width,
+            depth=config.depth,
+            heads=config.heads,
+            feedforward_width=config.feedforward_width,
+            dropout=config.dropout,
+        )
+        self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
+        self.reset()
+
+    def _check_settings(self) -> None:
+        unknown = set(self.config.loss_weights) - {"s", "a"}
+        if unknown:
+            raise ValueError(f"loss_weights names {', '.join(sorted(unknown))}; only s and a are predicted.")
+        if self.config.target_return is not None and "rtg" not in self.factors:
+            raise ValueError(
+                f"target_return is {self.config.target_return}, but this model has no return factor: its dataset has "
+                "no 'observation.return_to_go'."
+            )
+        self._acting_table(self.config.inference_mask)
+
+    # --- Training ----------------------------------------------------------------------------------------------------
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """The loss of one batch.
+
+        Args:
+            batch: `observation.state` (B, K, D), `action` (B, K, D), `observation.return_to_go` (B, K), each with its
+                `*_is_pad` (B, K), `timestamp` (B,) and `index` (B,), as LeRobot's dataset gives them. Not changed.
+
+        Returns:
+            The scalar loss, and each factor's part in it for the log.
+        """
+        window = self.make_window(batch)
+        step = self.updates if self.training else VALIDATION_STEP
+        mask = self.training_masks(window.valid, _index(batch, window), seed=self.config.mask_seed, step=step)
+        window = self.statistics.normalise(window)
+        predictions = self.network(window, mask.visible)
+        losses = masked_losses(predictions, window, mask.predict, self.factors)
+        loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
+        return loss, {f"loss_{name}": part.item() for name, part in losses.items()}
+
+    def update(self) -> None:
+        """Count an update; LeRobot calls this after each optimiser step."""
+        self.updates += 1
+
+    def get_optim_params(self):
+        return self.parameters()
+
+    # --- Asking ------------------------------------------------------------------------------------------------------
+
+    def make_window(self, batch: Mapping[str, Tensor]) -> Window:
+        """A LeRobot batch as a window of this model, in the dataset's units (`window.make_window` gives the shapes)."""
+        window = make_window(
+            {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)},
+            self.config.features,
+            self.config.context_length,
+            horizon=self.statistics.horizon,
+            fps=self.statistics.fps,
+        )
+        return window
+
+    @torch.no_grad()
+    def infer(
+        self,
+        window: Window | Mapping[str, Tensor] | None,
+        mask: Mask | str,
+        *,
+        t: int | None = None,
+        given: Given | None = None,
+    ) -> Answer:
+        """The distribution of every asked-for token given the shown ones.
+
+        Args:
+            window: recorded values: a LeRobot batch ((B, K, ...) under the dataset's keys) or a Window; None where
+                everything shown is in `given`. Not changed.
+            mask: a question, the name of a task, or a Mask.
+            t: the step that the question is about, where it has a t.
+            given: values of single tokens, {"s[-1]": [15, 15], "rtg[0]": 5}, instead of the recorded ones.
+
+        Raises:
+            MaskError: the question does not fit the model, or not this t.
+            ValueError: a shown token is neither recorded nor given, or a given value is not a legal one.
+        """
+        window, mask = self._pose(window, mask, t, given)
+        with _evaluation(self):
+            return inference.answer(self.network, self.statistics, self.factors, window, mask)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        window: Window | Mapping[str, Tensor] | None,
+        mask: Mask | str,
+        *,
+        t: int | None = None,
+        given: Given | None = None,
+        order: str = "forward",
+        seed: int = 0,
+    ) -> Window:
+        """Draw the asked-for tokens jointly, one after another by the chain rule; see `infer` for the other arguments.
+
+        Args:
+            order: `forward` in time, `backward` or `random`.
+            seed: the same seed draws the same samples.
+
+        Returns:
+            A window in the dataset's units: shown values as they were, drawn ones where asked, NaN elsewhere.
+        """
+        window, mask = self._pose(window, mask, t, given)
+        generator = torch.Generator(self.device).manual_seed(seed)
+        with _evaluation(self):
+            return inference.sample(
+                self.network, self.statistics, self.factors, window, mask, order=order, generator=generator
+            )
+
+    def _pose(
+        self, window: Window | Mapping[str, Tensor] | None, mask: Mask | str, t: int | None, given: Given | None
+    ) -> tuple[Window, Mask]:
+        """The window and mask of a question, on the policy's device, with nothing shown that is not known."""
+        K = self.config.context_length
+        recorded = window is not None
+        if window is None:
+            window = RolloutMemory(self.factors, K, 1, self.device).window(self.statistics.horizon)  # empty
+        elif not isinstance(window, Window):
+            window = self.make_window(window)
+        window = window.to(self.device)
+        batch_size = len(window.valid)
+        tokens = inference.read_given(given or {}, self.factors, K, batch_size)
+        known = {name: torch.full((K,), recorded) for name in self.factors}
+        for name, step in tokens:  # here the user changes a recorded window on purpose
+            known[name][step] = False
+        window, known = inference.give(window, tokens, known)
+        if isinstance(mask, Mask):
+            text = mask.draw()
+        else:
+            text, mask = mask, self._table(mask).at(t, batch_size)
+        inference.check_known(mask, known, text)
+        return window, mask.to(self.device).within(window.valid)
+
+    def _table(self, text: str) -> MaskTable:
+        return tabulate(text, tuple(self.factors), self.config.context_length)
+
+    def _acting_table(self, text: str) -> MaskTable:
+        """The table of a question that a rollout can ask at every step.
+
+        Raises:
+            MaskError: it does not ask for a[t].
+        """
+        table = self._table(text)
+        K = self.config.context_length
+        steps = table.t.tolist()
+        if steps != list(range(K)) or not all(table.predict[t, table.factors.index("a"), t] for t in steps):
+            raise MaskError("A mask for a rollout asks for a[t] at every step, as 'a[t] | s[:t+1], a[:t]' does.", text)
+        return table
+
+    # --- Acting ------------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget the episode; LeRobot calls this once for each batch of environments."""
+        self._memory: RolloutMemory | None = None
+
+    @torch.no_grad()
+    def select_action(
+        self,
+        batch: dict[str, Tensor],
+        *,
+        mask: str | None = None,
+        given: Given | None = None,
+        sample: bool | None = None,
+        **_: Any,
+    ) -> Tensor:
+        """One action for each environment: the answer to the inference mask at the present step.
+
+        Args:
+            batch: `observation.state` (B, D) of this step; `observation.return_so_far` (B, 1) where a return is asked
+                for and the episode is longer than the window. Not changed.
+            mask: this step's question, instead of `inference_mask`.
+            given: values of window positions, instead of the config's; what has been observed wins over them.
+            sample: draw the action instead of taking the most likely one; None: as `sample_actions` says.
+
+        Returns:
+            (B, D) in the dataset's units: int64 category numbers, or float32.
+
+        Raises:
+            MaskError: the mask does not ask for a[t] or does not fit the model.
+            ValueError: the mask shows a later token that nobody gives.
+        """
+        state = self._state(batch)
+        memory = self._memory
+        if memory is None or len(memory.valid) != len(state):
+            memory = self._memory = RolloutMemory(self.factors, self.config.context_length, len(state), self.device)
+        text = self.config.inference_mask if mask is None else mask
+        table = self._acting_table(text)
+        so_far = batch.get(RETURN_SO_FAR)
+        memory.observe(state, so_far.to(self.device).reshape(-1) if so_far is not None else None)
+        tokens = inference.read_given(self._given(given), self.factors, self.config.context_length, len(state))
+        if ("rtg", 0) in tokens:
+            tokens["rtg", 0] = memory.remaining(tokens["rtg", 0].to(self.device))
+        window, known = inference.give(memory.window(self.statistics.horizon), tokens, memory.known())
+        posed = table.at(memory.position, len(state))
+        inference.check_known(posed, known, text)
+        with _evaluation(self):
+            answer = inference.answer(self.network, self.statistics, self.factors, window, posed.to(self.device))
+        chosen = self.config.sample_actions if sample is None else sample
+        parts = [d.draw(None) if chosen else d.most_likely for d in answer["a"]]
+        action = torch.cat(parts, dim=-1)[:, memory.position]  # (B, D)
+        memory.act(action)
+        discrete = all(component.discrete for component in self.factors["a"].components)
+        return action.long() if discrete else action
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """A chunk of one action, (B, 1, D): the question is asked anew at every step."""
+        return self.select_action(batch, **kwargs).unsqueeze(1)
+
+    def _given(self, given: Given | None) -> Given:
+        if given is not None:
+            return given
+        target = self.config.target_return
+        return self.config.given if target is None else {**self.config.given, "rtg[0]": target}
+
+    def _state(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """(B, D) of the present step's `s`."""
+        parts = []
+        for feature in self.config.features["s"]:
+            value = batch.get(feature.key)
+            if value is None or value.shape[-1] != feature.size or value.ndim != 2:
+                found = "nothing" if value is None else f"shape {tuple(value.shape)}"
+                raise ValueError(
+                    f"This policy observes {feature.key!r} with {feature.size} numbers, (batch, {feature.size}); "
+                    f"the environment gives {found} under that name."
+                )
+            parts.append(value.to(self.device, torch.float32))
+        return torch.cat(parts, dim=-1)
+
+    # --- Checkpoints -------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        return self.updates.device
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
+        **kwargs: Any,
+    ) -> "UniMASKPolicy":
+        """Load a checkpoint, from a folder or the Hub, as LeRobot's base class does; weights load strictly.
+
+        Args:
+            dataset_stats: statistics of the dataset to go on with (fine-tuning); they replace the checkpoint's.
+
+        Raises:
+            ValueError: the weights are not this model's: names every missing, extra or misshapen tensor.
+        """
+        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
+        if dataset_stats is not None:
+            policy.statistics.fill(dataset_stats)
+        return policy
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: "UniMASKPolicy", model_file: str, map_location: str, strict: bool
+    ) -> "UniMASKPolicy":
+        """Strictly, whatever `strict` says: LeRobot never passes it, and a partly loaded model answers nonsense."""
+        try:
+            weights = load_file(model_file, device="cpu")
+        except (SafetensorError, OSError) as error:
+            raise ValueError(f"{model_file} cannot be read as safetensors: {error}") from error
+        expected = model.state_dict()
+        faults = [f"missing {name}" for name in expected if name not in weights]
+        faults += [f"extra {name}" for name in weights if name not in expected]
+        faults += [
+            f"{name} has shape {tuple(weights[name].shape)} instead of {tuple(tensor.shape)}"
+            for name, tensor in expected.items()
+            if name in weights and weights[name].shape != tensor.shape
+        ]
+        if faults:
+            raise ValueError(f"The weights in {model_file} are not those of its config: {'; '.join(faults)}.")
+        model.load_state_dict(weights)
+        return model
+
+
+class _evaluation:
+    """Answers are given without dropout, also while the policy is being trained."""
+
+    def __init__(self, policy: torch.nn.Module):
+        self.policy = policy
+
+    def __enter__(self) -> None:
+        self.was_training = self.policy.training
+        if self.was_training:
+            self.policy.eval()
+
+    def __exit__(self, *_: Any) -> None:
+        if self.was_training:
+            self.policy.train()
+
+
+def _index(batch: Mapping[str, Tensor], window: Window) -> Tensor:
+    """(B,) the frame that each window starts at; a batch that no dataset made is numbered from 0."""
+    if "index" in batch:
+        return batch["index"].reshape(-1).to(window.valid.device)
+    return torch.arange(len(window.valid), device=window.valid.device)

@@ -1,0 +1,213 @@
+"""LeRobot batch -> Window: the factors of K steps as tensors, in the dataset's units.
+
+Legend of shapes: B windows, K steps, D the dimensions of a factor.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+STATE = "observation.state"
+ENVIRONMENT_STATE = "observation.environment_state"
+ACTION = "action"
+RETURN_TO_GO = "observation.return_to_go"
+RETURN_SO_FAR = "observation.return_so_far"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column of the dataset inside a factor, as the checkpoint's config stores it."""
+
+    key: str
+    size: int
+    categories: list[int] | None = None  # per dimension; None: continuous
+    names: list[str] | None = None  # per dimension, for people
+
+
+@dataclass(frozen=True)
+class Component:
+    """What one output head predicts: a single discrete dimension of a factor, or a run of continuous ones."""
+
+    name: str
+    dims: slice  # of the factor's D
+    categories: int | None  # None: continuous
+    computed: bool = False  # by this package, not stored in the dataset or given by a user
+
+    @property
+    def discrete(self) -> bool:
+        return self.categories is not None
+
+    @property
+    def size(self) -> int:
+        """Numbers that a head puts out for it: logits, or one mean per dimension."""
+        return self.categories if self.discrete else self.dims.stop - self.dims.start
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What the mask language calls `s`, `a`, `rtg` or by a property's name."""
+
+    name: str
+    components: tuple[Component, ...]
+
+    @property
+    def size(self) -> int:
+        """D, the numbers of one token."""
+        return self.components[-1].dims.stop
+
+    @property
+    def given_size(self) -> int:
+        """The first of the D numbers, which a dataset stores and a user gives."""
+        return max(component.dims.stop for component in self.components if not component.computed)
+
+
+def make_factors(features: Mapping[str, Sequence[Feature]]) -> dict[str, Factor]:
+    """The model's factors from the features that its config stores under each name."""
+    factors = {}
+    for name, columns in features.items():
+        components: list[Component] = []
+        start = 0
+        for feature in columns:
+            if feature.categories is None:
+                label = feature.key.removeprefix("observation.")
+                components.append(Component(label, slice(start, start + feature.size), None))
+            else:
+                labels = feature.names or [f"{feature.key.removeprefix('observation.')}.{i}" for i in range(feature.size)]
+                for i, (label, count) in enumerate(zip(labels, feature.categories, strict=True)):
+                    components.append(Component(label, slice(start + i, start + i + 1), count))
+            start += feature.size
+        if name == "rtg":  # the token is the pair (return-to-go, timestep / horizon)
+            components.append(Component("timestep", slice(start, start + 1), None, computed=True))
+        factors[name] = Factor(name, tuple(components))
+    return factors
+
+
+@dataclass
+class Window:
+    """K steps of B trajectories.
+
+    values: factor -> (B, K, D) float32, in the dataset's units; discrete values are category numbers. `rtg` holds
+        (return-to-go, timestep / horizon).
+    valid: (B, K) bool, False past the episode's end.
+    """
+
+    values: dict[str, Tensor]
+    valid: Tensor
+
+    def to(self, device: torch.device) -> "Window":
+        return Window({name: value.to(device) for name, value in self.values.items()}, self.valid.to(device))
+
+
+def make_window(
+    batch: Mapping[str, Tensor],
+    features: Mapping[str, Sequence[Feature]],
+    context_length: int,
+    *,
+    horizon: Tensor,
+    fps: Tensor,
+) -> Window:
+    """Read a window from a LeRobot batch, which is not changed.
+
+    Args:
+        batch: the dataset's keys, each (B, K, size) or, for features of one number, (B, K) or (B, K, 1);
+            `observation.state_is_pad` (B, K) if steps lie past the episode's end; `timestamp` (B,), seconds of step 0.
+        horizon: steps of an episode. With `fps` it turns the timestamp into the return token's timestep / horizon.
+
+    Raises:
+        KeyError: a column that the model needs is missing.
+        ValueError: a column's shape is not (B, context_length, size).
+    """
+    values = {}
+    for name, columns in features.items():
+        parts = [_column(batch, feature, context_length) for feature in columns]
+        if name == "rtg":
+            parts.append(_timestep(batch, parts[0], fps) / horizon)
+        values[name] = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+    first = next(iter(values.values()))
+    pad = batch.get(f"{STATE}_is_pad", batch.get(f"{ACTION}_is_pad"))
+    valid = ~pad if pad is not None else torch.ones(first.shape[:2], dtype=torch.bool, device=first.device)
+    return Window(values, valid)
+
+
+def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:
+    """(B, K, size) float32."""
+    if feature.key not in batch:
+        raise KeyError(f"The batch lacks {feature.key!r}, which this model reads; it has {', '.join(sorted(batch))}.")
+    value = batch[feature.key]
+    shape = tuple(value.shape)
+    if value.ndim == 2 and feature.size == 1:
+        value = value.unsqueeze(-1)
+    if value.ndim != 3 or value.shape[1:] != (K, feature.size):
+        raise ValueError(
+            f"{feature.key} has shape {shape}; a window of this model is (batch, {K}, {feature.size}): "
+            f"{K} steps from the sampled frame on."
+        )
+    return value.float()
+
+
+def _timestep(batch: Mapping[str, Tensor], like: Tensor, fps: Tensor) -> Tensor:
+    """Each step's number within its episode, (B, K, 1)."""
+    steps = torch.arange(like.shape[1], device=like.device, dtype=like.dtype).expand(like.shape[:2])
+    if "timestamp" in batch:
+        first = (batch["timestamp"].reshape(-1, 1).to(like) * fps).round()  # (B, 1)
+        steps = steps + first
+    return steps.unsqueeze(-1)
+
+
+class Statistics(nn.Module):
+    """Everything that the model knows about the dataset's units, as buffers: they are saved with the weights.
+
+    Discrete numbers and computed ones keep mean 0 and standard deviation 1, so that one rule serves every factor. Until
+    `fill` is called, nothing is scaled.
+    """
+
+    def __init__(self, features: Mapping[str, Sequence[Feature]], factors: Mapping[str, Factor], context_length: int):
+        super().__init__()
+        self.features = features
+        for name, factor in factors.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(factor.size))
+            self.register_buffer(f"{name}_std", torch.ones(factor.size))
+        self.register_buffer("horizon", torch.tensor(float(context_length)))  # steps of the longest episode
+        self.register_buffer("fps", torch.tensor(1.0))
+
+    def fill(self, dataset_stats: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take over a dataset's statistics, as `LeRobotDatasetMetadata.stats` holds them.
+
+        Raises:
+            KeyError: a continuous feature has no mean and standard deviation there.
+        """
+        for name, columns in self.features.items():
+            mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
+            start = 0
+            for feature in columns:
+                dims = slice(start, start + feature.size)
+                start += feature.size
+                if feature.categories is None:
+                    if feature.key not in dataset_stats:
+                        raise KeyError(f"The dataset's statistics lack {feature.key!r}: recompute them with LeRobot.")
+                    mean[dims] = _numbers(dataset_stats[feature.key]["mean"])
+                    deviation = _numbers(dataset_stats[feature.key]["std"])
+                    std[dims] = torch.where(deviation > 0, deviation, 1.0)  # a constant is only shifted
+        if "frame_index" in dataset_stats and "timestamp" in dataset_stats:
+            last = _numbers(dataset_stats["frame_index"]["max"])
+            self.horizon.fill_(last.item() + 1)
+            self.fps.fill_((last / _numbers(dataset_stats["timestamp"]["max"])).item() if last > 0 else 1.0)
+
+    def normalise(self, window: Window) -> Window:
+        values = {
+            name: (value - self.get_buffer(f"{name}_mean")) / self.get_buffer(f"{name}_std")
+            for name, value in window.values.items()
+        }
+        return Window(values, window.valid)
+
+    def denormalise(self, name: str, component: Component, value: Tensor) -> Tensor:
+        """A network's output for one continuous component, (..., d), in the dataset's units."""
+        mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
+        return value * std[component.dims] + mean[component.dims]
+
+
+def _numbers(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float32).flatten()
