@@ -168,7 +168,7 @@ class Maze2DEnv(gym.Env):
     `reset(options=...)` reads these keys and ignores others, LeRobot's among them:
         goal: (row, column) of a free cell.
         position, velocity: the start (x, y) and (vx, vy), taken exactly, so that a recorded episode can be replayed.
-    What is not given is drawn as in D4RL: a free cell, the position around it, the velocity, another cell as goal.
+    What is not given is drawn: a free cell, the position around it, the velocity, another cell as goal.
     Drawn starts are float32 numbers, so a float32 record of them is exact.
 
     Raises:
@@ -228,7 +228,7 @@ class Maze2DEnv(gym.Env):
             velocity = (START_SPEED * self.np_random.standard_normal(2)).astype(np.float32).tolist()
         self._goal = goal or self._draw_cell(other_than=cell)
 
-        mujoco.mj_resetData(self._model, self._data)  # the solver's warm start too, or a replay would differ
+        mujoco.mj_resetData(self._model, self._data)  # time and the solver's warm start too
         self._data.qpos[:] = position
         self._data.qvel[:] = velocity
         self._trail = [tuple(position)]

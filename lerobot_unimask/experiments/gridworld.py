@@ -1,0 +1,225 @@
+"""The questions of the paper's two gridworld figures, put to one policy trained on DoorKey (sections 5.1 and 5.2).
+
+Everything here returns data that goes into a JSON; `plots` draws it.
+
+Legend of shapes: N trajectories, K = 10 steps of the window, which is a whole episode.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dataset_builders.doorkey import Episodes
+from lerobot_unimask.envs.doorkey import DOOR, GOAL, HORIZON, DoorKeyEnv, cell_at, step
+from lerobot_unimask.inference import Answer, Given
+from lerobot_unimask.masks import parse_token
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.window import RETURN_SO_FAR, STATE, Window
+
+
+def state_at(agent: tuple[int, int], key: tuple[int, int]) -> list[int]:
+    """A state as the dataset stores it, [agent cell, key cell], from two (x, y)."""
+    return [int(cell_at(*agent)), int(cell_at(*key))]
+
+
+# The start of the four rollouts: the key lies beside the agent, one step to the right.
+START = state_at((1, 2), (2, 2))
+
+# Name of the panel -> (question, what it is given). Only who goes down first, away from the key, meets the waypoint.
+ROLLOUTS: dict[str, tuple[str, dict[str, list[int] | float]]] = {
+    "Imitation": ("a[t] | s[:t+1], a[:t]", {}),
+    "Another goal": ("a[t] | s[:t+1], a[:t], s[-1]", {"s[-1]": state_at((1, 4), (1, 4))}),
+    "A wanted return": ("a[t] | s[:t+1], a[:t], rtg[0]", {"rtg[0]": 2.0}),
+    "A waypoint": ("a[t] | s[:t+1], a[:t], s[3]", {"s[3]": state_at((2, 4), (2, 2))}),
+}
+BACKWARDS = "Backwards"
+BACKWARDS_QUESTION = "s[:-1], a[:-1] | s[-1]"
+BACKWARDS_GIVEN = {"s[-1]": [GOAL, GOAL]}
+
+# The paper's figure of predicted states: from the bottom of the left room, over the key, into the door.
+SHOWN_STATES: dict[int, list[int]] = {
+    0: state_at((2, 4), (1, 2)),
+    3: state_at((1, 2), (1, 2)),
+    6: [DOOR, DOOR],
+}
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One question and the N trajectories that answer it, as plain lists.
+
+    Attributes:
+        name: What the question is about, for people.
+        question: In the mask language.
+        given: Values of single tokens, {"s[-1]": [agent cell, key cell], "rtg[0]": 2.0}.
+        states: (N, K, 2) agent and key cells, s[0] to s[K-1].
+        actions: (N, K) of a rollout, which also has the action after the last state; (N, K - 1) of samples.
+        achieved: What came of it, one entry for each trajectory under every name: `return` and `success` of a rollout,
+            `impossible_steps` of samples, and for each given state whether it was `reached`, as in "s[-1] reached".
+    """
+
+    name: str
+    question: str
+    given: dict[str, list[int] | float]
+    states: list[list[list[int]]]
+    actions: list[list[int]]
+    achieved: dict[str, list[float] | list[bool] | list[int]]
+
+
+def five_panels(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> list[Panel]:
+    """The paper's gridworld figure: four rollouts of the most likely actions, and histories sampled backwards.
+
+    Args:
+        policy: Trained on DoorKey, with a window of 10 steps.
+        histories: How many to sample.
+        seed: Of those samples.
+
+    Raises:
+        ValueError: The policy's window is not one episode.
+    """
+    if policy.config.context_length != HORIZON:
+        raise ValueError(
+            f"These questions are about whole episodes of {HORIZON} steps; this policy's context_length is "
+            f"{policy.config.context_length}."
+        )
+    panels = [rollout_panel(policy, name, question, given) for name, (question, given) in ROLLOUTS.items()]
+    return [*panels, backwards_panel(policy, histories=histories, seed=seed)]
+
+
+def rollout_panel(
+    policy: UniMASKPolicy, name: str, question: str, given: Given, *, start: Sequence[int] = START
+) -> Panel:
+    """Ask `question` at every step of one episode in the real environment, and take the most likely actions."""
+    episodes = roll_out(policy, [start], question, given)
+    states = np.stack([episodes.agent, episodes.key], axis=-1)[:, :HORIZON]  # (1, K, 2)
+    achieved = {
+        "return": episodes.reward.sum(axis=1).astype(float).tolist(),
+        "success": (episodes.agent == GOAL).any(axis=1).tolist(),
+    }
+    return Panel(
+        name, question, dict(given), states.tolist(), episodes.action.tolist(), achieved | _reached(states, given)
+    )
+
+
+def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> Panel:
+    """Sample histories of a final state from the end to the start: a[K-2], s[K-2], a[K-3], ..., s[0].
+
+    The model's word is taken for the dynamics here; `impossible_steps` counts where it is wrong.
+    """
+    K = policy.config.context_length
+    empty = Window(
+        {name: torch.zeros(histories, K, factor.size) for name, factor in policy.factors.items()},
+        torch.ones(histories, K, dtype=torch.bool),
+    )
+    drawn = policy.sample(empty, BACKWARDS_QUESTION, given=BACKWARDS_GIVEN, order="backward", seed=seed)
+    states = drawn.values["s"].long().cpu().numpy()  # (N, K, 2)
+    actions = drawn.values["a"][:, :-1, 0].long().cpu().numpy()  # (N, K - 1)
+    achieved = {"impossible_steps": (~possible_steps(states, actions)).sum(axis=1).tolist()}
+    return Panel(BACKWARDS, BACKWARDS_QUESTION, dict(BACKWARDS_GIVEN), states.tolist(), actions.tolist(), achieved)
+
+
+def predicted_states(policy: UniMASKPolicy, shown: Mapping[int, Sequence[int]] | None = None) -> Answer:
+    """Every other state's distribution given the states of a few steps; nothing is said about actions.
+
+    Args:
+        shown: Step -> [agent cell, key cell]; the paper's steps 0, 3 and 6 by default. Another episode's states do too.
+
+    Returns:
+        The answer about one window; `answer["s"]` has the agent's distribution, (1, K, 16), and the key's.
+    """
+    shown = SHOWN_STATES if shown is None else shown
+    tokens = [f"s[{at}]" for at in shown]
+    given = {token: list(state) for token, state in zip(tokens, shown.values(), strict=True)}
+    return policy.infer(None, f"s[:] | {', '.join(tokens)}", given=given)
+
+
+def roll_out(
+    policy: UniMASKPolicy,
+    starts: Sequence[Sequence[int]],
+    question: str,
+    given: Given,
+    *,
+    sample: bool = False,
+    seed: int = 0,
+) -> Episodes:
+    """Play whole episodes in the real environment, all at once, asking the policy `question` at every step.
+
+    Args:
+        starts: N times [agent cell, key cell].
+        question: A mask that asks for a[t].
+        given: Values of single tokens, shared or one per episode.
+        sample: Draw the actions instead of taking the most likely ones.
+        seed: Of those draws; the global generator is left as it was.
+
+    Returns:
+        What the expert's rollouts are made of too; the states include the one after the last action.
+
+    Raises:
+        ValueError: A start that the environment does not have; a question that cannot be asked at every step.
+    """
+    envs = [DoorKeyEnv(render_mode=None) for _ in starts]
+    observations = [
+        env.reset(options={"agent": agent, "key": key})[0] for env, (agent, key) in zip(envs, starts, strict=True)
+    ]
+    states, doors, actions, rewards = [_states(observations)], [_doors(envs)], [], []
+    cuda = [policy.device] if policy.device.type == "cuda" else []
+    policy.reset()
+    with torch.random.fork_rng(devices=cuda):
+        torch.manual_seed(seed)
+        for _ in range(HORIZON):
+            chosen = policy.select_action(_batch(observations), mask=question, given=given, sample=sample)  # (N, 1)
+            played = [env.step(action) for env, action in zip(envs, chosen.cpu().numpy(), strict=True)]
+            observations = [observation for observation, *_ in played]
+            states.append(_states(observations))
+            doors.append(_doors(envs))
+            actions.append(chosen[:, 0].cpu().numpy())
+            rewards.append(np.array([reward for _, reward, *_ in played], dtype=np.int64))
+    policy.reset()
+    agent, key = np.moveaxis(np.stack(states, axis=1), -1, 0)  # (N, K + 1) each
+    return Episodes(agent, key, np.stack(doors, axis=1), np.stack(actions, axis=1), np.stack(rewards, axis=1))
+
+
+def possible_steps(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Whether each state follows from the one before by the action between them.
+
+    An open door needs no key, but it takes the key to open it, and a key once taken is carried on: the two cells of a
+    state decide every step.
+
+    Args:
+        states: (N, T, 2) agent and key cells.
+        actions: (N, T - 1).
+
+    Returns:
+        (N, T - 1) bool.
+    """
+    agent, key = states[..., 0], states[..., 1]
+    next_agent, next_key, _ = step(agent[:, :-1], key[:, :-1], np.array(False), actions)
+    return (next_agent == agent[:, 1:]) & (next_key == key[:, 1:])
+
+
+def _reached(states: np.ndarray, given: Given) -> dict[str, list[bool]]:
+    """For each given state, whether the trajectories, (N, K, 2), were in it at its step."""
+    reached = {}
+    for token, value in given.items():
+        factor, at = parse_token(token, ("s", "a", "rtg"), states.shape[1])
+        if factor == "s":
+            reached[f"{token} reached"] = (states[:, at] == np.asarray(value)).all(axis=-1).tolist()
+    return reached
+
+
+def _batch(observations: Sequence[Mapping[str, np.ndarray]]) -> dict[str, torch.Tensor]:
+    """The environments' observations under LeRobot's names."""
+    so_far = np.stack([observation["return_so_far"] for observation in observations])
+    return {STATE: torch.from_numpy(_states(observations)), RETURN_SO_FAR: torch.from_numpy(so_far)}
+
+
+def _states(observations: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray:
+    """(N, 2)"""
+    return np.stack([observation["agent_pos"] for observation in observations])
+
+
+def _doors(envs: Sequence[DoorKeyEnv]) -> np.ndarray:
+    """(N,) bool"""
+    return np.array([env.door_open for env in envs])

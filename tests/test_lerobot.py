@@ -1,0 +1,159 @@
+"""LeRobot's own command lines, unchanged, drive the plugin: train, validate, evaluate, save, resume, fine-tune."""
+
+import json
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from dataset_builders.doorkey import build_doorkey
+from lerobot_unimask import UniMASKPolicy
+
+SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
+TRAIN = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", *SMALL]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_doorkey(tmp_path_factory.mktemp("data") / "doorkey", episodes=40, progress=False)
+
+
+def dataset(root: Path) -> list[str]:
+    return ["--dataset.repo_id=local/doorkey", f"--dataset.root={root}"]
+
+
+def command(name: str, *arguments: str, cwd: Path) -> str:
+    """Run a console script as a user would and return what it printed."""
+    script = Path(sys.executable).with_name(name)
+    done = subprocess.run([script, *arguments], cwd=cwd, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+def in_process(script: str, *arguments: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same main function without paying for LeRobot's import again."""
+    from lerobot.scripts import lerobot_eval, lerobot_train
+
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    {"lerobot-train": lerobot_train.main, "lerobot-eval": lerobot_eval.main}[script]()
+
+
+@pytest.fixture(scope="module")
+def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run of the real command with LeRobot's own defaults for workers and asynchronous environments."""
+    folder = tmp_path_factory.mktemp("train")
+    flags = ["--steps=4", "--batch_size=8", "--dataset.eval_split=0.25", "--eval_steps=2", "--save_freq=2"]
+    flags += ["--log_freq=1", "--env.type=doorkey", "--env_eval_freq=4", "--eval.n_episodes=3", "--eval.batch_size=3"]
+    log = command("lerobot-train", *TRAIN, *dataset(root), *flags, "--num_workers=1", "--output_dir=run", cwd=folder)
+    return folder / "run", log
+
+
+def test_lerobot_train_trains_validates_evaluates_and_saves(trained: tuple[Path, str]) -> None:
+    run, log = trained
+    assert log.count("eval_loss=") == 2
+    assert "'n_episodes': 3" in log
+    assert [path.name for path in sorted(run.glob("checkpoints/00*"))] == ["000002", "000004"]
+    assert len(list(run.glob("eval/videos_step_*/doorkey_0/*.mp4"))) == 3
+    policy = UniMASKPolicy.from_pretrained(run / "checkpoints/last/pretrained_model")
+    assert int(policy.updates) == 4
+    assert policy.config.features["s"][0].categories == [16, 16]
+
+
+def test_lerobot_eval_with_other_questions(trained: tuple[Path, str], tmp_path: Path) -> None:
+    checkpoint = trained[0] / "checkpoints/last/pretrained_model"
+    log = command(
+        "lerobot-eval",
+        f"--policy.path={checkpoint}",
+        "--env.type=doorkey",
+        "--eval.n_episodes=4",
+        "--eval.batch_size=2",
+        "--policy.inference_mask=a[t] | s[:t+1], a[:t], s[-1], rtg[0]",
+        "--policy.target_return=5",
+        '--policy.given={"s[-1]": [15, 15]}',
+        "--output_dir=eval",
+        cwd=tmp_path,
+    )
+    assert "async" not in log.lower().split("error")[-1] or "Traceback" not in log
+    info = json.loads((tmp_path / "eval/eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 4
+    assert {"pc_success", "avg_sum_reward"} <= info["overall"].keys()
+    assert len(list((tmp_path / "eval").rglob("*.mp4"))) == 4
+    returns = info["per_task"][0]["metrics"]["sum_rewards"]
+    assert all(-10 <= value <= 10 and value == round(value) for value in returns)
+
+
+@pytest.fixture
+def losses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Every training loss of the runs that follow, at full precision."""
+    recorded: list[float] = []
+    forward = UniMASKPolicy.forward
+
+    def recording(self, batch):
+        loss, parts = forward(self, batch)
+        if self.training:
+            recorded.append(loss.item())
+        return loss, parts
+
+    monkeypatch.setattr(UniMASKPolicy, "forward", recording)
+    return recorded
+
+
+def test_a_resumed_run_has_the_losses_of_one_that_was_not_interrupted(
+    root: Path, tmp_path: Path, losses: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = [*TRAIN, *dataset(root), "--policy.dropout=0", "--batch_size=4", "--num_workers=0", "--save_freq=4"]
+    run = tmp_path / "run"
+    # 40 windows are ten batches: eight updates stay within the first epoch, as far as LeRobot restores the order.
+    in_process("lerobot-train", *flags, "--steps=8", f"--output_dir={run}", monkeypatch=monkeypatch)
+    whole = losses.copy()
+    losses.clear()
+    config = run / "checkpoints/000004/pretrained_model/train_config.json"
+    (run / "checkpoints/last").unlink()
+    (run / "checkpoints/last").symlink_to("000004")
+    in_process("lerobot-train", f"--config_path={config}", "--resume=true", monkeypatch=monkeypatch)
+    assert len(whole) == 8
+    assert losses == whole[4:]
+
+
+def test_fine_tuning_goes_on_from_the_weights_with_other_masks(
+    trained: tuple[Path, str], root: Path, tmp_path: Path, losses: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = trained[0] / "checkpoints/last/pretrained_model"
+    flags = [f"--policy.path={checkpoint}", "--policy.push_to_hub=false", "--policy.training_masks=past"]
+    flags += [*dataset(root), "--steps=2", "--batch_size=8", "--num_workers=0", f"--output_dir={tmp_path / 'run'}"]
+    in_process("lerobot-train", *flags, monkeypatch=monkeypatch)
+    tuned = UniMASKPolicy.from_pretrained(tmp_path / "run/checkpoints/last/pretrained_model")
+    assert tuned.config.training_masks == "past"
+    assert int(tuned.updates) == 4 + 2
+    before = UniMASKPolicy.from_pretrained(checkpoint)
+    moved = (tuned.network.positions - before.network.positions).abs().max()
+    assert 0 < moved < 0.05  # a fine-tuned model, not a fresh one
+    assert len(losses) == 2
+
+
+def test_bad_settings_end_before_anything_is_written(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.ERROR)
+    run = tmp_path / "run"
+    flags = [*TRAIN, *dataset(root), "--steps=2", "--num_workers=0", f"--output_dir={run}"]
+    with pytest.raises(ValueError, match="no factor 'q'"):
+        in_process("lerobot-train", *flags, "--policy.training_masks=a[t] | q[0]", monkeypatch=monkeypatch)
+    assert not run.exists()
+
+
+def test_global_generators_do_not_matter_to_validation(trained: tuple[Path, str], root: Path) -> None:
+    """The validation loss of a checkpoint is one number, however often and in whatever order it is computed."""
+    from lerobot_unimask.experiments.validation import first_windows, task_losses
+
+    policy = UniMASKPolicy.from_pretrained(trained[0] / "checkpoints/last/pretrained_model")
+    batch = first_windows(policy, root, "local/doorkey")
+    torch.manual_seed(1)
+    once = task_losses(policy, batch, ["behavior_cloning", "random_mask"])
+    torch.manual_seed(2)
+    again = task_losses(policy, batch, ["random_mask", "behavior_cloning"])
+    assert once == again
+    assert batch["observation.state"].shape == (40, 10, 2)
