@@ -48,7 +48,9 @@ def make_parser() -> argparse.ArgumentParser:
 
     build = commands.add_parser("build", help="roll out an expert and write a LeRobotDataset", allow_abbrev=False)
     environments = build.add_subparsers(dest="environment", required=True, metavar="ENVIRONMENT")
-    doorkey = environments.add_parser("doorkey", help="the paper's gridworld, a noisy-rational expert", allow_abbrev=False)
+    doorkey = environments.add_parser(
+        "doorkey", help="the paper's gridworld, a noisy-rational expert", allow_abbrev=False
+    )
     _dataset_arguments(doorkey, episodes=500)
     doorkey.add_argument(
         "--expert",

@@ -12,6 +12,7 @@ from lerobot_unimask.masks import MAX_CONTEXT, RANDOM_MASK, mixture, parse
 from lerobot_unimask.window import RETURN_TO_GO, Feature
 
 TOKEN_LAYOUTS = ("stacked", "separate")
+CONTINUOUS_HEADS = ("l2", "gaussian")
 
 
 @PreTrainedConfig.register_subclass("unimask")
@@ -37,9 +38,12 @@ class UniMASKConfig(PreTrainedConfig):
     # Training masks are a function of this seed, the update count and the frame's index.
     inference_mask: str = "behavior_cloning"
     # The question that acting asks at every step; it must ask for a[t].
-    target_return: float | None = None
-    # The return to ask for from an episode's first step on, shown as rtg[0] where the inference mask shows it.
-    given: dict[str, list[list[float]] | list[float] | float] = field(default_factory=dict)
+    target_return: float | str | None = None
+    # The return to ask for from an episode's first step on, shown as rtg[0] where the inference mask shows it; "auto":
+    # that of the training episode whose first state is nearest, times target_return_scale.
+    target_return_scale: float = 1.1
+    # The paper asks for a tenth more than the nearest episode returned.
+    given: dict[str, list[list[float] | float] | float] = field(default_factory=dict)
     # Values of single tokens in a rollout's window, {"s[-1]": [15, 15]}, in the dataset's units.
     sample_actions: bool = False
     # Act by sampling from the answer instead of taking its most likely action.
@@ -47,6 +51,10 @@ class UniMASKConfig(PreTrainedConfig):
     # The network
     token_layout: str = "stacked"
     # "stacked": one token per step, made of all its factors; "separate": one token per factor and step.
+    fine_inputs: bool = True
+    # Continuous values come with displacements, sines and cosines; False: the plain numbers, as in the paper.
+    continuous_head: str = "l2"
+    # What is predicted of continuous values: "l2", a mean by the squared error, or "gaussian", a mean and a scale.
     width: int = 128
     depth: int = 3
     heads: int = 8
@@ -66,6 +74,8 @@ class UniMASKConfig(PreTrainedConfig):
     # Read off the training dataset and saved, so that a checkpoint knows what it was trained on.
     features: dict[str, list[Feature]] = field(default_factory=dict)
     # Factor name -> the dataset's columns that make it up.
+    remembered_episodes: int = 0
+    # How many training episodes' first states and returns the checkpoint holds, for target_return=auto.
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
@@ -80,6 +90,10 @@ class UniMASKConfig(PreTrainedConfig):
             self.drop_n_last_frames = self.context_length - 1
         if self.token_layout not in TOKEN_LAYOUTS:
             raise ValueError(f"token_layout is {self.token_layout!r}; choose one of {', '.join(TOKEN_LAYOUTS)}.")
+        if self.continuous_head not in CONTINUOUS_HEADS:
+            raise ValueError(
+                f"continuous_head is {self.continuous_head!r}; choose one of {', '.join(CONTINUOUS_HEADS)}."
+            )
         for name in ("width", "depth", "heads", "feedforward_width"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
@@ -87,6 +101,8 @@ class UniMASKConfig(PreTrainedConfig):
             raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout is {self.dropout}; it must lie in [0, 1).")
+        if isinstance(self.target_return, str) and self.target_return != "auto":
+            raise ValueError(f"target_return is {self.target_return!r}; give a number or auto.")
         if self.target_return is not None and "rtg[0]" in self.given:
             raise ValueError("target_return and given both name rtg[0]; give one of them.")
         # Syntax alone: which factors exist is known once the dataset or the checkpoint has been read.

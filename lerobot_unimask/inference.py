@@ -31,6 +31,7 @@ class Distribution:
     component: Component
     probabilities: Tensor | None  # (B, K, categories), of a discrete component
     mean: Tensor | None  # (B, K, d), of a continuous one
+    scale: Tensor | None = None  # (B, K, d), its standard deviation: 0 where shown; None from an L2 head
 
     @property
     def name(self) -> str:
@@ -45,10 +46,15 @@ class Distribution:
         return torch.where(self.probabilities.isnan().any(-1, keepdim=True), torch.nan, best)
 
     def draw(self, generator: torch.Generator | None) -> Tensor:
-        """One sample for each step, (B, K, d). The L2 head has no spread: of a continuous component it is the mean."""
+        """One sample for each step, (B, K, d). An L2 head has no spread: there it is the mean."""
         if self.probabilities is None:
-            return self.mean
-        certain = functional.one_hot(torch.zeros_like(self.probabilities[..., 0], dtype=torch.long), self.component.size)
+            if self.scale is None:
+                return self.mean
+            noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device)
+            return self.mean + self.scale * noise
+        certain = functional.one_hot(
+            torch.zeros_like(self.probabilities[..., 0], dtype=torch.long), self.component.size
+        )
         weights = torch.where(self.probabilities.isnan(), certain.to(self.probabilities.dtype), self.probabilities)
         drawn = torch.multinomial(weights.flatten(0, 1), 1, generator=generator)
         return drawn.view(*self.probabilities.shape[:2], 1).to(self.probabilities.dtype)
@@ -81,6 +87,7 @@ def answer(
         known = shown | mask.predict[name].unsqueeze(-1)  # (B, K, 1)
         distributions[name] = []
         for output, component in zip(outputs, factors[name].components, strict=True):
+            output = output.float()  # also under autocast, or probabilities would not sum to one
             value = window.values[name][..., component.dims]
             if component.discrete:
                 certain = torch.where(shown, value, 0.0).squeeze(-1).long()
@@ -89,8 +96,11 @@ def answer(
                 probabilities = torch.where(known, probabilities, torch.nan)
                 distributions[name].append(Distribution(component, probabilities, None))
             else:
-                mean = torch.where(shown, value, statistics.denormalise(name, component, output))
-                distributions[name].append(Distribution(component, None, torch.where(known, mean, torch.nan)))
+                mean, scale = statistics.denormalise(name, component, output)
+                mean = torch.where(known, torch.where(shown, value, mean), torch.nan)
+                if scale is not None:
+                    scale = torch.where(known, torch.where(shown, 0.0, scale), torch.nan)
+                distributions[name].append(Distribution(component, None, mean, scale))
     return Answer(mask, distributions)
 
 
@@ -127,9 +137,7 @@ def sample(
         shuffle = torch.randperm(len(tokens), generator=generator, device=generator.device).tolist()
         tokens = [tokens[i] for i in shuffle]
     visible = {name: shown.clone() for name, shown in mask.visible.items()}
-    values = {
-        name: torch.where(visible[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()
-    }
+    values = {name: torch.where(visible[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()}
     drawn = Window(values, window.valid)
     for name, step in tokens:
         here = torch.zeros_like(mask.predict[name])
@@ -216,7 +224,7 @@ def check_known(mask: Mask, known: Mapping[str, Tensor], text: str) -> None:
     missing = [
         f"{name}[{step}]"
         for name, shown in mask.visible.items()
-        for step in (shown.any(0) & ~known[name]).nonzero().flatten().tolist()
+        for step in (shown.any(0).cpu() & ~known[name]).nonzero().flatten().tolist()
     ]
     if missing:
         example = missing[0]
@@ -226,22 +234,23 @@ def check_known(mask: Mask, known: Mapping[str, Tensor], text: str) -> None:
         )
 
 
-# --- Acting ------------------------------------------------------------------------------------------------------------
+# --- Acting ----------------------------------------------------------------------------------------------------------
 
 
 class RolloutMemory:
     """The last K states and actions of each environment in a batch, and the return each had received by then.
 
-    The present stands at position min(step, K - 1): before the window is full later positions are empty, then it slides.
+    The present stands at position min(step, K - 1): before the window is full, later positions are empty; then it
+    slides.
     """
 
     def __init__(self, factors: Mapping[str, Factor], context_length: int, batch_size: int, device: torch.device):
         K = context_length
         self.step = -1  # of the episode; nothing has been observed yet
-        self.values = {
-            name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()
-        }
+        self.acted = True  # the step has ended, so that the next observation begins another
+        self.values = {name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()}
         self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
+        self.target_return: Tensor | None = None  # (B, 1) or (1, 1): asked for from the first step on
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
 
     @property
@@ -255,19 +264,25 @@ class RolloutMemory:
         return self.step - self.position
 
     def observe(self, state: Tensor, return_so_far: Tensor | None) -> None:
-        """Begin a step: (B, D) of `s`, and (B,) the rewards received so far, where the environment reports them."""
+        """Begin a step: (B, D) of `s`, and (B,) the rewards received so far, where the environment reports them.
+
+        Where the last step found no action, because its question was refused, it begins again.
+        """
         K = self.valid.shape[1]
-        self.step += 1
-        if self.step >= K:
-            for name in ASKABLE:
-                self.values[name] = self.values[name].roll(-1, dims=1)
-            self.return_so_far = self.return_so_far.roll(-1, dims=1)
+        if self.acted:
+            self.step += 1
+            if self.step >= K:
+                for name in ASKABLE:
+                    self.values[name] = self.values[name].roll(-1, dims=1)
+                self.return_so_far = self.return_so_far.roll(-1, dims=1)
+            self.acted = False
         self.values["s"][:, self.position] = state
         self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
 
     def act(self, action: Tensor) -> None:
         """End the step: (B, D) of `a`."""
         self.values["a"][:, self.position] = action
+        self.acted = True
 
     def known(self) -> dict[str, Tensor]:
         """factor -> (K,) bool: states up to the present, actions before it."""
@@ -298,4 +313,3 @@ class RolloutMemory:
                 "'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
             )
         return target_return - received
-

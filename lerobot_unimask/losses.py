@@ -3,19 +3,26 @@
 Legend of shapes: B windows, K steps, D the dimensions of a factor.
 """
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lerobot_unimask.window import Component, Factor, Window
+from lerobot_unimask.window import LOG_SCALE, Component, Factor, Window
 
 
 def component_loss(prediction: Tensor, value: Tensor, component: Component) -> Tensor:
-    """What one component costs at every step, (B, K): cross-entropy in nats, or the squared error's mean over the
-    component's dimensions, in units of their standard deviations."""
+    """What one component costs at every step, (B, K): cross-entropy in nats; or, averaged over its dimensions and in
+    units of their standard deviations, the squared error or a Gaussian's negative log-likelihood in nats."""
     target = value[..., component.dims]
     if component.discrete:
         return functional.cross_entropy(prediction.transpose(1, 2), target.squeeze(-1).long(), reduction="none")
+    if component.gaussian:
+        mean, log_scale = prediction.chunk(2, dim=-1)
+        log_scale = log_scale.clamp(*LOG_SCALE)
+        surprise = (target - mean) * (-log_scale).exp()
+        return (surprise.square() / 2 + log_scale + math.log(2 * math.pi) / 2).mean(-1)
     return (prediction - target).square().mean(-1)
 
 

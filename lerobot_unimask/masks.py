@@ -198,7 +198,11 @@ def parse_token(text: str, factors: Sequence[str], context_length: int) -> tuple
     Raises:
         MaskError: it is not one token of this model's window.
     """
-    terms = _Parser(text).terms()
+    _check_text(text)
+    parser = _Parser(text)
+    terms = parser.terms()
+    if parser.tokens[parser.next][0] != "end":
+        parser.fail("the end of the text")
     steps = [step for term in terms for step in term.steps]
     if len(steps) != 1 or not isinstance(steps[0], Index) or steps[0].relative:
         raise MaskError("A value is given to a single token, such as s[-1] or rtg[0].", text, 0)
@@ -213,12 +217,11 @@ def parse(text: str) -> Question:
     Raises:
         MaskError: the text does not parse; shows it with a caret under the fault.
     """
-    if not isinstance(text, str):
-        raise TypeError(f"A mask is written as text, such as 'a[t] | s[:t+1], a[:t]'; got {type(text).__name__}.")
-    if len(text) > MAX_TEXT:
-        raise MaskError(f"A mask text has at most {MAX_TEXT} characters, this one has {len(text)}.", text[:60] + " ...")
+    _check_text(text)
     name = text.strip()
     if re.fullmatch(r"\w+", name):
+        if name == RANDOM_MASK or name in REGIMES:
+            raise MaskError(f"{name} is a way of training, not a question: only training_masks can name it.", text)
         if name not in TASKS:
             near = difflib.get_close_matches(name, [*TASKS, RANDOM_MASK, *REGIMES], n=1)
             hint = f" Did you mean {near[0]!r}?" if near else ""
@@ -230,6 +233,13 @@ def parse(text: str) -> Question:
             )
         text = TASKS[name]
     return _Parser(text).question()
+
+
+def _check_text(text: str) -> None:
+    if not isinstance(text, str):
+        raise TypeError(f"A mask is written as text, such as 'a[t] | s[:t+1], a[:t]'; got {type(text).__name__}.")
+    if len(text) > MAX_TEXT:
+        raise MaskError(f"A mask text has at most {MAX_TEXT} characters, this one has {len(text)}.", text[:60] + " ...")
 
 
 # --- From a text to rows ---------------------------------------------------------------------------------------------
@@ -260,13 +270,15 @@ class MaskTable:
             raise MaskError("The question is about a step t: say which, as in t=3.", self.question.text)
         elif int(t) not in self.t.tolist():
             admitted = ", ".join(map(str, self.t.tolist()))
-            raise MaskError(f"The question cannot be asked at t={int(t)}; it can at t = {admitted}.", self.question.text)
+            raise MaskError(
+                f"The question cannot be asked at t={int(t)}; it can at t = {admitted}.", self.question.text
+            )
         else:
             row = self.t.tolist().index(int(t))
         shape = (batch_size, self.visible.shape[-1])
         return Mask(
-            {name: self.visible[row, f].expand(shape) for f, name in enumerate(self.factors)},
-            {name: self.predict[row, f].expand(shape) for f, name in enumerate(self.factors)},
+            {name: self.visible[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
+            {name: self.predict[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
         )
 
 
@@ -375,6 +387,11 @@ class Mask:
         visible = {name: shown & valid for name, shown in self.visible.items()}
         predict = {name: asked & valid for name, asked in self.predict.items()}
         return Mask(visible, predict)
+
+    def repeat(self, times: int) -> "Mask":
+        """Each window's mask `times` times, one after another."""
+        visible = {name: shown.repeat_interleave(times, dim=0) for name, shown in self.visible.items()}
+        return Mask(visible, {name: asked.repeat_interleave(times, dim=0) for name, asked in self.predict.items()})
 
     def to(self, device: torch.device) -> "Mask":
         return Mask(
@@ -492,7 +509,7 @@ def mixture(masks: str | Sequence[str] | Mapping[str, float]) -> dict[str, float
 
 
 def counter_uniform(seed: int, step: Tensor | int, index: Tensor, n: int) -> Tensor:
-    """n uniform numbers in [0, 1) for each entry of `index` (B,), a pure function of (seed, step, index): (B, n) float32.
+    """n uniform numbers in [0, 1) for each of `index` (B,), a pure function of (seed, step, index): (B, n) float32.
 
     SplitMix64's finaliser (Steele, Lea and Flood, 2014) as a counter-based hash.
     """

@@ -1,11 +1,12 @@
 """UniMASKPolicy: the masked model behind LeRobot's policy contract, and the questions that one can ask it."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -17,7 +18,8 @@ from lerobot_unimask.inference import Answer, Given, RolloutMemory
 from lerobot_unimask.losses import masked_losses
 from lerobot_unimask.masks import Mask, MaskError, MaskTable, TrainingMasks, tabulate
 from lerobot_unimask.networks.transformer import Transformer
-from lerobot_unimask.window import RETURN_SO_FAR, Statistics, Window, make_factors, make_window
+from lerobot_unimask.returns import EpisodeStarts, read_starts
+from lerobot_unimask.window import RETURN_SO_FAR, RETURN_TO_GO, Statistics, Window, make_factors, make_window
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +35,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         config: with `features` read off a dataset, or LeRobot's input and output features.
         dataset_stats: statistics to normalise with, `LeRobotDatasetMetadata.stats`; without them nothing is scaled
             until a checkpoint is loaded.
+        dataset_meta: the training dataset's metadata; its folder holds how each episode began and what it returned.
 
     Raises:
         ValueError: the dataset lacks states or actions, or the settings ask for a factor that it does not have.
@@ -43,7 +46,11 @@ class UniMASKPolicy(PreTrainedPolicy):
     name = "unimask"
 
     def __init__(
-        self, config: UniMASKConfig, dataset_stats: Mapping[str, Mapping[str, Any]] | None = None, **_: Any
+        self,
+        config: UniMASKConfig,
+        dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **_: Any,
     ) -> None:
         super().__init__(config)
         config.validate_features()
@@ -52,16 +59,17 @@ class UniMASKPolicy(PreTrainedPolicy):
                 "unimask ignores the camera features %s; LeRobot decodes them all the same.",
                 ", ".join(config.image_features),
             )
-        self.factors = make_factors(config.features)
+        self.factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
         self._check_settings()
         self.statistics = Statistics(config.features, self.factors, config.context_length)
-        if dataset_stats is not None:
-            self.statistics.fill(dataset_stats)
+        self.episode_starts = EpisodeStarts(config.remembered_episodes, self.factors["s"].size)
+        self._read_dataset(dataset_stats, dataset_meta)
         self.training_masks = TrainingMasks(config.training_masks, tuple(self.factors), config.context_length)
         self.network = Transformer(
             self.factors,
             context_length=config.context_length,
             stacked=config.token_layout == "stacked",
+            fine_inputs=config.fine_inputs,
             width=config.width,
             depth=config.depth,
             heads=config.heads,
@@ -69,7 +77,20 @@ class UniMASKPolicy(PreTrainedPolicy):
             dropout=config.dropout,
         )
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
+        # What to ask for at the start of an episode: as the config says, or a function of its first states, (B, D) ->
+        # (B, 1), both in the dataset's units, which Python alone can set.
+        self.target_return: float | str | Callable[[Tensor], Tensor] | None = config.target_return
         self.reset()
+
+    def _read_dataset(self, stats: Mapping[str, Mapping[str, Any]] | None, meta: LeRobotDatasetMetadata | None) -> None:
+        """Take over what is kept of a training dataset: its statistics, and its episodes' starts and returns."""
+        if stats is not None:
+            self.statistics.fill(stats)
+        if meta is not None and "rtg" in self.factors:
+            starts = read_starts(Path(meta.root), [f.key for f in self.config.features["s"]], RETURN_TO_GO)
+            if starts is not None:
+                self.episode_starts.fill(*starts)
+                self.config.remembered_episodes = len(starts[0])
 
     def _check_settings(self) -> None:
         unknown = set(self.config.loss_weights) - {"s", "a"}
@@ -157,12 +178,14 @@ class UniMASKPolicy(PreTrainedPolicy):
         *,
         t: int | None = None,
         given: Given | None = None,
+        samples: int = 1,
         order: str = "forward",
         seed: int = 0,
     ) -> Window:
         """Draw the asked-for tokens jointly, one after another by the chain rule; see `infer` for the other arguments.
 
         Args:
+            samples: how many of each window; those of a window stand together in the result, (B * samples, K, D).
             order: `forward` in time, `backward` or `random`.
             seed: the same seed draws the same samples.
 
@@ -170,6 +193,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             A window in the dataset's units: shown values as they were, drawn ones where asked, NaN elsewhere.
         """
         window, mask = self._pose(window, mask, t, given)
+        window, mask = window.repeat(samples), mask.repeat(samples)
         generator = torch.Generator(self.device).manual_seed(seed)
         with _evaluation(self):
             return inference.sample(
@@ -256,9 +280,14 @@ class UniMASKPolicy(PreTrainedPolicy):
         table = self._acting_table(text)
         so_far = batch.get(RETURN_SO_FAR)
         memory.observe(state, so_far.to(self.device).reshape(-1) if so_far is not None else None)
-        tokens = inference.read_given(self._given(given), self.factors, self.config.context_length, len(state))
-        if ("rtg", 0) in tokens:
-            tokens["rtg", 0] = memory.remaining(tokens["rtg", 0].to(self.device))
+        given = self.config.given if given is None else given
+        tokens = inference.read_given(given, self.factors, self.config.context_length, len(state))
+        if memory.step == 0:
+            memory.target_return = self._choose_target(state)
+        if "rtg" in self.factors:
+            target = tokens.get(("rtg", 0), memory.target_return)
+            if target is not None:
+                tokens["rtg", 0] = memory.remaining(target.to(self.device))
         window, known = inference.give(memory.window(self.statistics.horizon), tokens, memory.known())
         posed = table.at(memory.position, len(state))
         inference.check_known(posed, known, text)
@@ -275,11 +304,16 @@ class UniMASKPolicy(PreTrainedPolicy):
         """A chunk of one action, (B, 1, D): the question is asked anew at every step."""
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
-    def _given(self, given: Given | None) -> Given:
-        if given is not None:
-            return given
-        target = self.config.target_return
-        return self.config.given if target is None else {**self.config.given, "rtg[0]": target}
+    def _choose_target(self, state: Tensor) -> Tensor | None:
+        """The return to ask for from these first states (B, D) on, (B, 1) or (1, 1)."""
+        target = self.target_return
+        if target is None:
+            return None
+        if callable(target):
+            return torch.as_tensor(target(state), dtype=torch.float32, device=self.device).reshape(-1, 1)
+        if target == "auto":
+            return self.config.target_return_scale * self.episode_starts.nearest_return(state)
+        return torch.tensor([[float(target)]], device=self.device)
 
     def _state(self, batch: Mapping[str, Tensor]) -> Tensor:
         """(B, D) of the present step's `s`."""
@@ -307,19 +341,20 @@ class UniMASKPolicy(PreTrainedPolicy):
         pretrained_name_or_path: str | Path,
         *,
         dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
         **kwargs: Any,
     ) -> "UniMASKPolicy":
         """Load a checkpoint, from a folder or the Hub, as LeRobot's base class does; weights load strictly.
 
         Args:
-            dataset_stats: statistics of the dataset to go on with (fine-tuning); they replace the checkpoint's.
+            dataset_stats, dataset_meta: of the dataset to go on with (fine-tuning): what they say of it replaces what
+                the checkpoint kept of its own.
 
         Raises:
             ValueError: the weights are not this model's: names every missing, extra or misshapen tensor.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
-        if dataset_stats is not None:
-            policy.statistics.fill(dataset_stats)
+        policy._read_dataset(dataset_stats, dataset_meta)
         return policy
 
     @classmethod

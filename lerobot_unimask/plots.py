@@ -4,7 +4,7 @@ Colours are those of Okabe and Ito (2008), which colour-blind readers can tell a
 are 9 inches wide: saved with `figure.savefig(path, dpi=200)` they read well at 900 pixels.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
@@ -18,13 +18,13 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.path import Path
 
 from lerobot_unimask.envs.doorkey import CELLS, DOOR, GOAL, coordinates
-from lerobot_unimask.experiments.gridworld import Panel
+from lerobot_unimask.experiments.gridworld import Panel, given_states
 from lerobot_unimask.inference import Answer
-from lerobot_unimask.masks import Mask, parse_token
+from lerobot_unimask.masks import Mask
 
-# Okabe and Ito's palette
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+# From Okabe and Ito's palette
+BLACK, ORANGE, GREEN = "#000000", "#E69F00", "#009E73"
+BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 WALL, FAINT = "#4D4D4D", "#E6E6E6"
 
 WIDTH = 9.0  # inches
@@ -85,16 +85,17 @@ def five_panels(panels: Sequence[Panel]) -> Figure:
     """Trajectories that answer one question each, side by side (the paper's gridworld figure).
 
     Under each panel's name stands its question, below the grid what came of it. Colour and arrows show time; the
-    jitter only keeps trajectories apart that share cells.
+    jitter only keeps trajectories apart that share cells. Drawn are the window's states: a rollout's last action, after
+    s[K-1], counts in its return alone.
     """
-    figure = Figure(figsize=(WIDTH, 2.95), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 2.72), layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
     steps = max(len(states) for panel in panels for states in panel.states)
     time = _time(steps)
     for number, (axes, panel) in enumerate(zip(row, panels, strict=True), start=1):
         draw_grid(axes)
         _draw_trajectories(axes, np.asarray(panel.states), time)
-        _draw_given(axes, panel.given, steps)
+        _draw_given(axes, panel)
         axes.text(0.5, 1.16, f"({number}) {panel.name}", transform=axes.transAxes, ha="center", fontsize=NORMAL)
         axes.set_title(panel.question, fontsize=0.86 * SMALL, family=MONOSPACE, pad=4)
         axes.set_xlabel(_outcome(panel), fontsize=SMALL + 0.5)
@@ -119,39 +120,38 @@ def _time(steps: int) -> ScalarMappable:
 
 
 def _draw_trajectories(axes: Axes, states: np.ndarray, time: ScalarMappable) -> None:
-    """The agent's ways, (N, T, 2), and where each one's key lay at first."""
+    """The agent's ways, (N, T, 2) agent and key cells, and where each one's key lay at first."""
     N, T, _ = states.shape
-    jitter = np.random.default_rng(0).uniform(-0.13, 0.13, size=(N, T, 2))  # always the same: part of the drawing
-    offset = 0.12 * (np.arange(N) - (N - 1) / 2)[:, None]  # (N, 1)
-    x, y = coordinates(states[..., 0])
-    x, y = x + offset + jitter[..., 0], y + offset + jitter[..., 1]
-    for n in range(N):
-        points = np.stack([x[n], y[n]], axis=-1)  # (T, 2)
-        segments = np.stack([points[:-1], points[1:]], axis=1)  # (T - 1, 2, 2)
-        axes.add_collection(LineCollection(segments, colors=time.to_rgba(np.arange(T - 1)), linewidths=1.5, zorder=2))
-        for (start, end), colour in zip(segments, time.to_rgba(np.arange(T - 1)), strict=True):
-            if np.hypot(*(end - start)) > 0.5:  # it moved
-                style = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 7}
-                axes.annotate("", start + 0.68 * (end - start), start + 0.5 * (end - start), arrowprops=style, zorder=3)
-        axes.scatter(*points[1:-1].T, c=time.to_rgba(np.arange(1, T - 1)), s=7, zorder=3)
-        axes.scatter(*points[0], marker="o", s=42, color=time.to_rgba(0), edgecolors="white", linewidths=0.8, zorder=4)
-        axes.scatter(
-            *points[-1], marker="s", s=38, color=time.to_rgba(T - 1), edgecolors=BLACK, linewidths=0.8, zorder=4
-        )
-    for cell in np.unique(states[:, 0, 1]):
-        key_x, key_y = coordinates(cell)
-        axes.scatter(
-            key_x + 0.25, key_y - 0.32, marker=KEY, s=130, color=ORANGE, edgecolors=BLACK, linewidths=0.4, zorder=5
-        )
+    jitter = np.random.default_rng(0).uniform(-0.1, 0.1, size=(N, T, 2))  # always the same: part of the drawing
+    apart = 0.18 * (np.arange(N) - (N - 1) / 2)  # (N,)
+    points = np.stack(coordinates(states[..., 0]), axis=-1) + apart[:, None, None] + jitter  # (N, T, 2)
+    for way in points:
+        _draw_way(axes, way, time.to_rgba(np.arange(T)))
+    key_x, key_y = coordinates(np.unique(states[:, 0, 1]))
+    style = {"color": ORANGE, "edgecolors": BLACK, "linewidths": 0.4}
+    axes.scatter(key_x + 0.25, key_y - 0.32, marker=KEY, s=130, zorder=5, **style)
 
 
-def _draw_given(axes: Axes, given: Mapping[str, object], steps: int) -> None:
+def _draw_way(axes: Axes, points: np.ndarray, colours: np.ndarray) -> None:
+    """One trajectory through (T, 2) points, with an arrow wherever the agent moved."""
+    segments = np.stack([points[:-1], points[1:]], axis=1)  # (T - 1, 2, 2)
+    axes.add_collection(LineCollection(segments, colors=colours[:-1], linewidths=1.5, zorder=2))
+    for (start, end), colour in zip(segments, colours[:-1], strict=True):
+        move = end - start
+        if np.hypot(*move) > 0.5:
+            style = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 9, "shrinkB": 0}
+            axes.annotate("", start + 0.66 * move, start + 0.2 * move, arrowprops=style, zorder=3)
+    axes.scatter(*points[1:-1].T, c=colours[1:-1], s=7, zorder=3)
+    axes.scatter(*points[0], marker="o", s=42, color=colours[0], edgecolors="white", linewidths=0.8, zorder=4)
+    axes.scatter(*points[-1], marker="s", s=38, color=colours[-1], edgecolors=BLACK, linewidths=0.8, zorder=4)
+
+
+def _draw_given(axes: Axes, panel: Panel) -> None:
     """A frame around the agent's cell of each state that was given in advance."""
-    for token, value in given.items():
-        if parse_token(token, ("s", "a", "rtg"), steps)[0] == "s":
-            x, y = coordinates(value[0])
-            _square(axes, x, y, fill=False, edgecolor=PURPLE, linewidth=2, linestyle=(0, (2.2, 1)), zorder=1.5)
-            axes.text(x - 0.42, y + 0.4, token, fontsize=SMALL - 1, family=MONOSPACE, zorder=6)
+    for token, (_, state) in given_states(panel.given, len(panel.states[0])).items():
+        x, y = coordinates(state[0])
+        _square(axes, x, y, fill=False, edgecolor=PURPLE, linewidth=2, linestyle=(0, (2.2, 1)), zorder=1.5)
+        axes.text(x - 0.42, y + 0.4, token, fontsize=SMALL - 1, family=MONOSPACE, zorder=6)
 
 
 def _outcome(panel: Panel) -> str:
@@ -164,9 +164,8 @@ def _outcome(panel: Panel) -> str:
         words = asked + words
         if not panel.given:
             words.append("goal reached" if all(panel.achieved["success"]) else "goal missed")
-    if "impossible_steps" in panel.achieved:
-        N, T = np.shape(panel.states)[:2]
-        words.append(f"{sum(panel.achieved['impossible_steps'])} of {N * (T - 1)} steps impossible")
+    if "possible" in panel.achieved:
+        words.append(f"{panel.achieved['possible']} of {panel.achieved['samples']} samples possible")
     return ", ".join(words)
 
 
@@ -217,7 +216,7 @@ def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
         neither = ", ".join(f"s[{at}]" for at in silent)
         raise ValueError(f"The picture needs every state shown or asked for; the answer has neither for {neither}.")
     columns = -(-len(agent) // 2)
-    figure = Figure(figsize=(WIDTH, 4.35), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 4.12), layout="constrained")
     grids = figure.subplots(2, columns, squeeze=False).flat
     probability = ScalarMappable(Normalize(0, 1), "Blues")
     for at, axes in enumerate(grids):

@@ -1,6 +1,15 @@
-"""Return-to-go. N frames, stored one episode after another; E episodes."""
+"""Return-to-go, and the return to ask for at evaluation.
+
+Legend of shapes: N frames, stored one episode after another; E episodes; B environments; D dimensions of a state.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+import pyarrow.dataset
+import torch
+from torch import Tensor, nn
 
 
 def return_to_go(rewards: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -28,3 +37,43 @@ def return_to_go(rewards: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         frames = starts[lengths == length, None] + np.arange(length)  # (episodes of this length, length)
         returns[frames] = rewards[frames][:, ::-1].cumsum(axis=1)[:, ::-1]
     return returns
+
+
+class EpisodeStarts(nn.Module):
+    """How each training episode began and what it returned, as buffers, so that a downloaded checkpoint has them too.
+
+    `states` is (E, D), `returns` (E,), both in the dataset's units.
+    """
+
+    def __init__(self, episodes: int, size: int):
+        super().__init__()
+        self.register_buffer("states", torch.zeros(episodes, size))
+        self.register_buffer("returns", torch.zeros(episodes))
+
+    def fill(self, states: Tensor, returns: Tensor) -> None:
+        self.states, self.returns = states.to(self.states), returns.to(self.returns)
+
+    def nearest_return(self, state: Tensor) -> Tensor:
+        """The return of the training episode whose first state is nearest, (B, D) -> (B, 1) (paper, appendix
+        "Maze2D experiments": Euclidean distance, the goal being part of the state).
+
+        Raises:
+            ValueError: no episode is kept.
+        """
+        if len(self.states) == 0:
+            raise ValueError(
+                "target_return=auto asks for what the nearest training episode returned, and this checkpoint keeps no "
+                "episodes: it was trained without 'observation.return_to_go' or by streaming. Give a number."
+            )
+        return self.returns[torch.cdist(state, self.states).argmin(dim=1)].unsqueeze(-1)
+
+
+def read_starts(root: Path, state_keys: Sequence[str], return_key: str) -> tuple[Tensor, Tensor] | None:
+    """First states (E, D) and returns (E,) of a LeRobotDataset's episodes; None if its data is not there."""
+    if not (root / "data").is_dir():
+        return None
+    data = pyarrow.dataset.dataset(root / "data", format="parquet")
+    first = data.to_table([*state_keys, return_key], filter=pyarrow.dataset.field("frame_index") == 0)
+    columns = [torch.tensor(np.array(first[key].to_pylist(), dtype=np.float32)) for key in (*state_keys, return_key)]
+    episodes = len(first)
+    return torch.cat([column.view(episodes, -1) for column in columns[:-1]], dim=1), columns[-1].view(episodes)

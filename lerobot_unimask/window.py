@@ -4,7 +4,7 @@ Legend of shapes: B windows, K steps, D the dimensions of a factor.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -16,6 +16,8 @@ ACTION = "action"
 RETURN_TO_GO = "observation.return_to_go"
 RETURN_SO_FAR = "observation.return_so_far"
 
+LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
+
 
 @dataclass(frozen=True)
 class Feature:
@@ -24,7 +26,7 @@ class Feature:
     key: str
     size: int
     categories: list[int] | None = None  # per dimension; None: continuous
-    names: list[str] | None = None  # per dimension, for people
+    names: list[str] | None = field(default=None, compare=False)  # per dimension, for people
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Component:
     dims: slice  # of the factor's D
     categories: int | None  # None: continuous
     computed: bool = False  # by this package, not stored in the dataset or given by a user
+    gaussian: bool = False  # continuous, predicted as a mean and a scale
 
     @property
     def discrete(self) -> bool:
@@ -42,8 +45,9 @@ class Component:
 
     @property
     def size(self) -> int:
-        """Numbers that a head puts out for it: logits, or one mean per dimension."""
-        return self.categories if self.discrete else self.dims.stop - self.dims.start
+        """What a head puts out for it: logits; a mean for each dimension; or means, then the logarithms of scales."""
+        width = self.dims.stop - self.dims.start
+        return self.categories if self.discrete else 2 * width if self.gaussian else width
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,12 @@ class Factor:
         return max(component.dims.stop for component in self.components if not component.computed)
 
 
-def make_factors(features: Mapping[str, Sequence[Feature]]) -> dict[str, Factor]:
-    """The model's factors from the features that its config stores under each name."""
+def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = False) -> dict[str, Factor]:
+    """The model's factors from the features that its config stores under each name.
+
+    Args:
+        gaussian: predict continuous components as a mean and a scale.
+    """
     factors = {}
     for name, columns in features.items():
         components: list[Component] = []
@@ -73,9 +81,12 @@ def make_factors(features: Mapping[str, Sequence[Feature]]) -> dict[str, Factor]
         for feature in columns:
             if feature.categories is None:
                 label = feature.key.removeprefix("observation.")
-                components.append(Component(label, slice(start, start + feature.size), None))
+                dims = slice(start, start + feature.size)
+                components.append(Component(label, dims, None, gaussian=gaussian))
             else:
-                labels = feature.names or [f"{feature.key.removeprefix('observation.')}.{i}" for i in range(feature.size)]
+                labels = feature.names or [
+                    f"{feature.key.removeprefix('observation.')}.{i}" for i in range(feature.size)
+                ]
                 for i, (label, count) in enumerate(zip(labels, feature.categories, strict=True)):
                     components.append(Component(label, slice(start + i, start + i + 1), count))
             start += feature.size
@@ -96,6 +107,11 @@ class Window:
 
     values: dict[str, Tensor]
     valid: Tensor
+
+    def repeat(self, times: int) -> "Window":
+        """Each window `times` times, one after another."""
+        values = {name: value.repeat_interleave(times, dim=0) for name, value in self.values.items()}
+        return Window(values, self.valid.repeat_interleave(times, dim=0))
 
     def to(self, device: torch.device) -> "Window":
         return Window({name: value.to(device) for name, value in self.values.items()}, self.valid.to(device))
@@ -145,7 +161,7 @@ def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:
             f"{feature.key} has shape {shape}; a window of this model is (batch, {K}, {feature.size}): "
             f"{K} steps from the sampled frame on."
         )
-    return value.float()
+    return value.to(torch.float32, copy=True)  # changing a window must not change the batch it was read from
 
 
 def _timestep(batch: Mapping[str, Tensor], like: Tensor, fps: Tensor) -> Tensor:
@@ -203,10 +219,14 @@ class Statistics(nn.Module):
         }
         return Window(values, window.valid)
 
-    def denormalise(self, name: str, component: Component, value: Tensor) -> Tensor:
-        """A network's output for one continuous component, (..., d), in the dataset's units."""
-        mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
-        return value * std[component.dims] + mean[component.dims]
+    def denormalise(self, name: str, component: Component, output: Tensor) -> tuple[Tensor, Tensor | None]:
+        """A network's output for one continuous component, (..., size), as mean and scale in the dataset's units, each
+        (..., d); the scale is None where the head predicts none."""
+        mean, std = self.get_buffer(f"{name}_mean")[component.dims], self.get_buffer(f"{name}_std")[component.dims]
+        if not component.gaussian:
+            return output * std + mean, None
+        normalised_mean, log_scale = output.chunk(2, dim=-1)
+        return normalised_mean * std + mean, log_scale.clamp(*LOG_SCALE).exp() * std
 
 
 def _numbers(value: Any) -> Tensor:

@@ -15,7 +15,9 @@ from lerobot_unimask.experiments.gridworld import (
     ROLLOUTS,
     SHOWN_STATES,
     START,
+    backwards_panel,
     five_panels,
+    given_states,
     possible_steps,
     predicted_states,
     roll_out,
@@ -41,7 +43,7 @@ def policy():
 
 @pytest.fixture(scope="module")
 def panels(policy):
-    return {panel.name: panel for panel in five_panels(policy, histories=4)}
+    return {panel.name: panel for panel in five_panels(policy)}
 
 
 def test_a_rollout_plays_by_the_rules(policy):
@@ -88,9 +90,9 @@ def test_the_five_panels_are_the_paper_s_and_fit_into_a_json(panels):
     assert list(panels) == [*ROLLOUTS, BACKWARDS]
     for panel in panels.values():
         assert json.loads(json.dumps(dataclasses.asdict(panel))) == dataclasses.asdict(panel)
-        count = 4 if panel.name == BACKWARDS else 1
+        count = 3 if panel.name == BACKWARDS else 1
         assert np.shape(panel.states) == (count, HORIZON, 2)
-        assert all(len(values) == count for values in panel.achieved.values())
+        assert all(len(values) == count for values in panel.achieved.values() if isinstance(values, list))
 
 
 @pytest.mark.parametrize("name", ROLLOUTS)
@@ -116,17 +118,24 @@ def test_a_given_state_counts_as_reached_at_its_step_alone(policy):
     assert ways[15, 15] == [False]  # three steps do not lead there
 
 
-def test_backwards_samples_end_in_the_given_state_and_their_impossible_steps_are_counted(panels):
-    panel = panels[BACKWARDS]
-    states, actions = np.array(panel.states), np.array(panel.actions)
+def test_given_states_are_found_by_step():
+    given = {"s[-1]": [15, 15], "rtg[0]": 4.0, "s[3]": START, "corner[0]": 1}
+    assert given_states(given, HORIZON) == {"s[-1]": (9, [15, 15]), "s[3]": (3, START)}
+
+
+def test_backwards_samples_end_in_the_given_state_and_the_fewest_impossible_steps_come_first(policy):
+    everything, few = (backwards_panel(policy, histories=histories, samples=30) for histories in (30, 2))
+    states, actions = np.array(everything.states), np.array(everything.actions)
     assert (states[:, -1] == GOAL).all()
-    assert actions.shape == (4, HORIZON - 1)
-    for n in range(4):
-        wrong = 0
-        for t in range(HORIZON - 1):
-            agent, key, _ = step(*states[n, t], np.array(False), actions[n, t])
-            wrong += [int(agent), int(key)] != states[n, t + 1].tolist()
-        assert panel.achieved["impossible_steps"][n] == wrong
+    assert actions.shape == (30, HORIZON - 1)
+    wrong = [0] * 30
+    for n, t in np.ndindex(actions.shape):
+        agent, key, _ = step(*states[n, t], np.array(False), actions[n, t])
+        wrong[n] += [int(agent), int(key)] != states[n, t + 1].tolist()
+    assert everything.achieved == {"samples": 30, "possible": wrong.count(0), "impossible_steps": sorted(wrong)}
+    assert wrong == sorted(wrong)
+    assert few.states == everything.states[:2]
+    assert few.achieved["possible"] == everything.achieved["possible"]
 
 
 def test_every_step_of_the_expert_is_possible():

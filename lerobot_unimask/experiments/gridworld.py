@@ -31,7 +31,7 @@ START = state_at((1, 2), (2, 2))
 ROLLOUTS: dict[str, tuple[str, dict[str, list[int] | float]]] = {
     "Imitation": ("a[t] | s[:t+1], a[:t]", {}),
     "Another goal": ("a[t] | s[:t+1], a[:t], s[-1]", {"s[-1]": state_at((1, 4), (1, 4))}),
-    "A wanted return": ("a[t] | s[:t+1], a[:t], rtg[0]", {"rtg[0]": 2.0}),
+    "A wanted return": ("a[t] | s[:t+1], a[:t], rtg[0]", {"rtg[0]": 4.0}),
     "A waypoint": ("a[t] | s[:t+1], a[:t], s[3]", {"s[3]": state_at((2, 4), (2, 2))}),
 }
 BACKWARDS = "Backwards"
@@ -53,11 +53,12 @@ class Panel:
     Attributes:
         name: What the question is about, for people.
         question: In the mask language.
-        given: Values of single tokens, {"s[-1]": [agent cell, key cell], "rtg[0]": 2.0}.
+        given: Values of single tokens, {"s[-1]": [agent cell, key cell], "rtg[0]": 4.0}.
         states: (N, K, 2) agent and key cells, s[0] to s[K-1].
         actions: (N, K) of a rollout, which also has the action after the last state; (N, K - 1) of samples.
-        achieved: What came of it, one entry for each trajectory under every name: `return` and `success` of a rollout,
-            `impossible_steps` of samples, and for each given state whether it was `reached`, as in "s[-1] reached".
+        achieved: What came of it. Of rollouts, a list with one entry for each: `return`, `success`, and for each given
+            state whether they were in it at its step, as in `s[-1] reached`. Of samples: how many `samples` were drawn,
+            how many of them are `possible`, and each shown one's number of `impossible_steps`.
     """
 
     name: str
@@ -65,16 +66,15 @@ class Panel:
     given: dict[str, list[int] | float]
     states: list[list[list[int]]]
     actions: list[list[int]]
-    achieved: dict[str, list[float] | list[bool] | list[int]]
+    achieved: dict[str, int | list[float] | list[bool] | list[int]]
 
 
-def five_panels(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> list[Panel]:
+def five_panels(policy: UniMASKPolicy, *, seed: int = 0) -> list[Panel]:
     """The paper's gridworld figure: four rollouts of the most likely actions, and histories sampled backwards.
 
     Args:
         policy: Trained on DoorKey, with a window of 10 steps.
-        histories: How many to sample.
-        seed: Of those samples.
+        seed: Of the samples.
 
     Raises:
         ValueError: The policy's window is not one episode.
@@ -85,7 +85,7 @@ def five_panels(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> 
             f"{policy.config.context_length}."
         )
     panels = [rollout_panel(policy, name, question, given) for name, (question, given) in ROLLOUTS.items()]
-    return [*panels, backwards_panel(policy, histories=histories, seed=seed)]
+    return [*panels, backwards_panel(policy, seed=seed)]
 
 
 def rollout_panel(
@@ -103,21 +103,40 @@ def rollout_panel(
     )
 
 
-def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> Panel:
+def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, samples: int = 100, seed: int = 0) -> Panel:
     """Sample histories of a final state from the end to the start: a[K-2], s[K-2], a[K-3], ..., s[0].
 
-    The model's word is taken for the dynamics here; `impossible_steps` counts where it is wrong.
+    Note: A state's two cells are drawn side by side, so some steps contradict the environment. The paper draws such a
+        step again; here whole histories are drawn, and those with the fewest impossible steps kept.
+
+    Args:
+        histories: How many to show.
+        samples: How many to choose them from, at least as many.
+        seed: Of the samples.
     """
     K = policy.config.context_length
     empty = Window(
-        {name: torch.zeros(histories, K, factor.size) for name, factor in policy.factors.items()},
-        torch.ones(histories, K, dtype=torch.bool),
+        {name: torch.zeros(samples, K, factor.size) for name, factor in policy.factors.items()},
+        torch.ones(samples, K, dtype=torch.bool),
     )
     drawn = policy.sample(empty, BACKWARDS_QUESTION, given=BACKWARDS_GIVEN, order="backward", seed=seed)
-    states = drawn.values["s"].long().cpu().numpy()  # (N, K, 2)
-    actions = drawn.values["a"][:, :-1, 0].long().cpu().numpy()  # (N, K - 1)
-    achieved = {"impossible_steps": (~possible_steps(states, actions)).sum(axis=1).tolist()}
-    return Panel(BACKWARDS, BACKWARDS_QUESTION, dict(BACKWARDS_GIVEN), states.tolist(), actions.tolist(), achieved)
+    states = drawn.values["s"].long().cpu().numpy()  # (samples, K, 2)
+    actions = drawn.values["a"][:, :-1, 0].long().cpu().numpy()  # (samples, K - 1)
+    impossible = (~possible_steps(states, actions)).sum(axis=1)  # (samples,)
+    best = impossible.argsort(kind="stable")[:histories]
+    achieved = {
+        "samples": samples,
+        "possible": int((impossible == 0).sum()),
+        "impossible_steps": impossible[best].tolist(),
+    }
+    return Panel(
+        BACKWARDS,
+        BACKWARDS_QUESTION,
+        dict(BACKWARDS_GIVEN),
+        states[best].tolist(),
+        actions[best].tolist(),
+        achieved,
+    )
 
 
 def predicted_states(policy: UniMASKPolicy, shown: Mapping[int, Sequence[int]] | None = None) -> Answer:
@@ -199,14 +218,21 @@ def possible_steps(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
     return (next_agent == agent[:, 1:]) & (next_key == key[:, 1:])
 
 
+def given_states(given: Given, context_length: int) -> dict[str, tuple[int, Sequence[int]]]:
+    """The states among the given values: token -> (step, [agent cell, key cell])."""
+    return {
+        token: (parse_token(token, ("s",), context_length)[1], value)
+        for token, value in given.items()
+        if token.partition("[")[0].strip() == "s"
+    }
+
+
 def _reached(states: np.ndarray, given: Given) -> dict[str, list[bool]]:
     """For each given state, whether the trajectories, (N, K, 2), were in it at its step."""
-    reached = {}
-    for token, value in given.items():
-        factor, at = parse_token(token, ("s", "a", "rtg"), states.shape[1])
-        if factor == "s":
-            reached[f"{token} reached"] = (states[:, at] == np.asarray(value)).all(axis=-1).tolist()
-    return reached
+    return {
+        f"{token} reached": (states[:, at] == np.asarray(state)).all(axis=-1).tolist()
+        for token, (at, state) in given_states(given, states.shape[1]).items()
+    }
 
 
 def _batch(observations: Sequence[Mapping[str, np.ndarray]]) -> dict[str, torch.Tensor]:

@@ -85,7 +85,9 @@ def validate(runs: Sequence[Path], root: Path, repo_id: str) -> dict:
         for path in checkpoints_of(run):
             policy = UniMASKPolicy.from_pretrained(path)
             batch = batch or first_windows(policy, root, repo_id)
-            masks = [text for text in (*TASKS, RANDOM_MASK) if "rtg" not in TASKS.get(text, "") or "rtg" in policy.factors]
+            masks = [
+                text for text in (*TASKS, RANDOM_MASK) if "rtg" not in TASKS.get(text, "") or "rtg" in policy.factors
+            ]
             losses = task_losses(policy, batch, masks)
             updates = int(policy.updates)
             curve[updates] = losses[RANDOM_MASK]
@@ -122,7 +124,9 @@ def _training_settings(checkpoint: Path) -> dict | None:
     config = json.loads(path.read_text())
     root = config["dataset"].get("root")
     keep = ("seed", "batch_size", "steps")
-    policy = {key: value for key, value in config["policy"].items() if isinstance(value, str | int | float | dict | list)}
+    policy = {
+        key: value for key, value in config["policy"].items() if isinstance(value, str | int | float | dict | list)
+    }
     for unrelated in ("input_features", "output_features", "features", "normalization_mapping", "pretrained_path"):
         policy.pop(unrelated, None)
     return {**{key: config[key] for key in keep}, "policy": policy, "data": _provenance(Path(root)) if root else None}

@@ -13,27 +13,65 @@ from lerobot_unimask.window import Factor, Window
 Predictions = dict[str, list[Tensor]]  # factor -> one (B, K, size) for each of its components
 
 
+class NumberEncoding(nn.Module):
+    """Continuous values, normalised, as inputs that a network can resolve.
+
+    A point mass moves by a fiftieth of its positions' standard deviation in a step, and its velocity is there only as
+    that difference. So each number comes with its displacement per step since the previous shown step, at several
+    scales because no dataset's statistics tell its size, and with sines and cosines. A displacement exists only where
+    both ends are shown, and looks only backwards in time.
+
+    Args:
+        size: numbers of one token.
+        fine: False leaves the numbers alone, as the paper has them.
+    """
+
+    def __init__(self, size: int, *, fine: bool):
+        super().__init__()
+        self.fine = fine
+        # Wavelengths of 4, 2, 1 and 1/2 standard deviations
+        self.register_buffer("frequencies", torch.pi / 2 * 2.0 ** torch.arange(4), persistent=False)
+        self.register_buffer("scales", 4.0 ** torch.arange(4), persistent=False)
+        self.size = size * (1 + 2 * 4 + 4) + 1 if fine else size
+
+    def forward(self, value: Tensor, visible: Tensor) -> Tensor:
+        """(B, K, d), 0 where hidden, and (B, K) -> (B, K, size)"""
+        if not self.fine:
+            return value
+        K = value.shape[1]
+        steps = torch.arange(K, device=value.device)
+        latest = torch.where(visible, steps, -1).cummax(1).values  # (B, K) the last shown step up to here
+        previous = functional.pad(latest, (1, -1), value=-1)  # ... before here
+        both = (visible & (previous >= 0)).unsqueeze(-1)
+        start = value.gather(1, previous.clamp_min(0).unsqueeze(-1).expand_as(value))
+        displacement = torch.where(both, (value - start) / (steps - previous).unsqueeze(-1), 0.0)
+        scaled = torch.tanh(displacement.unsqueeze(-1) * self.scales).flatten(2)
+        angles = (value.unsqueeze(-1) * self.frequencies).flatten(2)
+        return torch.cat([value, angles.sin(), angles.cos(), scaled, both.to(value.dtype)], dim=-1)
+
+
 class FactorEmbedding(nn.Module):
     """One factor's tokens. Hidden is learned, not zero: zero is a legal action and a legal position."""
 
-    def __init__(self, factor: Factor, width: int):
+    def __init__(self, factor: Factor, width: int, *, fine_inputs: bool):
         super().__init__()
         self.discrete = {c.dims.start: c.categories for c in factor.components if c.discrete}
         continuous = [i for c in factor.components if not c.discrete for i in range(c.dims.start, c.dims.stop)]
         self.continuous = continuous
         self.categories = nn.ModuleList(nn.Embedding(count, width) for count in self.discrete.values())
-        self.numbers = nn.Linear(len(continuous), width) if continuous else None
+        self.encoding = NumberEncoding(len(continuous), fine=fine_inputs)
+        self.numbers = nn.Linear(self.encoding.size, width) if continuous else None
         self.hidden = nn.Parameter(torch.randn(width))
 
     def forward(self, value: Tensor, visible: Tensor) -> Tensor:
         """(B, K, D) and (B, K) -> (B, K, W)"""
-        visible = visible.unsqueeze(-1)
+        shown = visible.unsqueeze(-1)
         # Replaced before it is embedded, so that not even a NaN in a hidden place can reach the network.
-        value = torch.where(visible, value, 0.0)
+        value = torch.where(shown, value, 0.0)
         parts = [table(value[..., i].long()) for i, table in zip(self.discrete, self.categories, strict=True)]
         if self.numbers is not None:
-            parts.append(self.numbers(value[..., self.continuous]))
-        return torch.where(visible, torch.stack(parts).sum(0), self.hidden)
+            parts.append(self.numbers(self.encoding(value[..., self.continuous], visible)))
+        return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
 
 
 class Block(nn.Module):
@@ -70,6 +108,7 @@ class Transformer(nn.Module):
         factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
         stacked: one token per step, made of all its factors (paper, appendix "Input stacking"); otherwise one token
             for each property, at the front, and one for each state and action, in the order of time.
+        fine_inputs: encode continuous values as `NumberEncoding` does.
     """
 
     def __init__(
@@ -78,6 +117,7 @@ class Transformer(nn.Module):
         *,
         context_length: int,
         stacked: bool,
+        fine_inputs: bool,
         width: int,
         depth: int,
         heads: int,
@@ -87,7 +127,9 @@ class Transformer(nn.Module):
         super().__init__()
         self.stacked = stacked
         self.properties = [name for name in factors if name not in ASKABLE]
-        self.embeddings = nn.ModuleDict({name: FactorEmbedding(factor, width) for name, factor in factors.items()})
+        self.embeddings = nn.ModuleDict(
+            {name: FactorEmbedding(factor, width, fine_inputs=fine_inputs) for name, factor in factors.items()}
+        )
         if stacked:
             self.stack = nn.Linear(len(factors) * width, width)
         tokens = context_length if stacked else len(self.properties) + len(ASKABLE) * context_length
@@ -99,7 +141,8 @@ class Transformer(nn.Module):
         self.heads = nn.ModuleDict({name: nn.Linear(width, sum(sizes)) for name, sizes in self.sizes.items()})
 
     def forward(self, window: Window, visible: dict[str, Tensor]) -> Predictions:
-        """Logits of discrete components and normalised means of continuous ones, for every step.
+        """For every step, logits of discrete components, and of continuous ones normalised means, or means and the
+        logarithms of scales.
 
         Args:
             window: normalised values.

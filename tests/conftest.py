@@ -1,0 +1,100 @@
+"""What the tests share: a small DoorKey dataset and policies that are made in milliseconds."""
+
+import os
+
+os.environ["HF_HUB_OFFLINE"] = "1"  # read when huggingface_hub is imported
+
+import pytest
+import torch
+
+torch.set_num_threads(1)  # two threads beside another busy process are many times slower than one
+
+EPISODES = 30
+CONTINUOUS_FEATURES = {
+    "observation.state": {"dtype": "float32", "shape": (3,), "names": ["x", "y", "goal"]},
+    "action": {"dtype": "float32", "shape": (2,), "names": None},
+    "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": None},
+}
+# Offsets and scales far from 0 and 1, so that a wrong unit shows.
+CONTINUOUS_STATS = {
+    "observation.state": {"mean": [100.0, -5.0, 0.5], "std": [10.0, 0.1, 0.0]},
+    "action": {"mean": [0.25, -2.0], "std": [0.5, 4.0]},
+    "observation.return_to_go": {"mean": [30.0], "std": [7.0]},
+    "frame_index": {"max": [49.0]},
+    "timestamp": {"max": [4.9]},
+}
+
+
+@pytest.fixture(scope="session")
+def doorkey_root(tmp_path_factory):
+    """The folder of a DoorKey dataset of 30 episodes. Not to be written to."""
+    from dataset_builders.doorkey import build_doorkey
+
+    return build_doorkey(tmp_path_factory.mktemp("doorkey") / "dataset", episodes=EPISODES, progress=False)
+
+
+@pytest.fixture(scope="session")
+def load_doorkey(doorkey_root):
+    """load_doorkey(context_length=10) -> LeRobotDataset whose items are windows."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_unimask.envs.doorkey import FPS
+
+    def load(context_length=10):
+        seconds = [step / FPS for step in range(context_length)]
+        keys = ("observation.state", "action", "observation.return_to_go")
+        return LeRobotDataset("local/doorkey", root=doorkey_root, delta_timestamps=dict.fromkeys(keys, seconds))
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def doorkey(load_doorkey):
+    """The dataset as a model of context length 10 reads it. Its `meta` has the features and the statistics."""
+    return load_doorkey()
+
+
+@pytest.fixture(scope="session")
+def doorkey_batch(doorkey):
+    """A LeRobot batch of eight windows: six full ones and two that run past the end of their episode."""
+    from torch.utils.data import default_collate
+
+    return default_collate([doorkey[i] for i in (0, 10, 20, 30, 40, 50, 64, 79)])
+
+
+@pytest.fixture(scope="session")
+def continuous_batch():
+    """A LeRobot batch of five windows of ten steps of `CONTINUOUS_FEATURES`; the last one has four valid steps."""
+    generator = torch.Generator().manual_seed(0)
+    batch = {"index": torch.arange(5), "timestamp": torch.tensor([0.0, 0.1, 1.0, 2.5, 4.4])}
+    for key in ("observation.state", "action", "observation.return_to_go"):
+        mean, std = (torch.tensor(CONTINUOUS_STATS[key][name]) for name in ("mean", "std"))
+        value = mean + std * torch.randn(5, 10, len(mean), generator=generator)
+        batch[key] = value.squeeze(-1)
+        batch[f"{key}_is_pad"] = torch.zeros(5, 10, dtype=torch.bool)
+        batch[f"{key}_is_pad"][4, 4:] = True
+    return batch
+
+
+@pytest.fixture(scope="session")
+def tiny_policy(doorkey):
+    """tiny_policy(**settings) -> an untrained DoorKey policy in evaluation mode; same settings, same weights.
+
+    `kind="continuous"` makes one of `CONTINUOUS_FEATURES`, `kind="gaussian"` the same with a Gaussian head; `features`
+    and `stats` replace those of the dataset.
+    """
+    from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+
+    def make(kind="doorkey", *, features=None, stats=None, **settings):
+        if kind == "gaussian":
+            settings = {"continuous_head": "gaussian"} | settings
+        if kind != "doorkey":
+            features, stats = features or CONTINUOUS_FEATURES, stats or CONTINUOUS_STATS
+        small = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "dropout": 0.0}
+        config = UniMASKConfig(device="cpu", **(small | settings))
+        config.set_dataset_feature_metadata(features or doorkey.meta.features)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            return UniMASKPolicy(config, dataset_stats=stats or doorkey.meta.stats).eval()
+
+    return make

@@ -1,0 +1,178 @@
+"""The config: validation, reading a dataset's features, the command line, and `config.json`."""
+
+import json
+
+import draccus
+import pytest
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+
+from lerobot_unimask import MaskError, UniMASKConfig
+from lerobot_unimask.window import Feature
+
+
+def make(**settings):
+    return UniMASKConfig(device="cpu", **settings)
+
+
+def parse(*arguments):
+    return draccus.parse(UniMASKConfig, args=["--device=cpu", *arguments])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"context_length": 0}, "context_length is 0"),
+        ({"context_length": 5000}, "context_length is 5000"),
+        ({"token_layout": "heap"}, "token_layout is 'heap'; choose one of stacked, separate"),
+        ({"continuous_head": "mixture"}, "continuous_head is 'mixture'; choose one of l2, gaussian"),
+        ({"width": 0}, "width is 0"),
+        ({"depth": -1}, "depth is -1"),
+        ({"heads": 0}, "heads is 0"),
+        ({"feedforward_width": 0}, "feedforward_width is 0"),
+        ({"width": 10, "heads": 4}, r"width \(10\) must be a multiple of heads \(4\)"),
+        ({"dropout": 1.0}, "dropout is 1.0"),
+        ({"dropout": -0.1}, "dropout is -0.1"),
+        ({"target_return": 5.0, "given": {"rtg[0]": 4.0}}, "both name rtg"),
+        ({"training_masks": []}, "training_masks is empty"),
+        ({"training_masks": {"past": -1.0}}, "weights are positive"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        make(**settings)
+
+
+@pytest.mark.parametrize("name", ["training_masks", "inference_mask"])
+@pytest.mark.parametrize("text", ["a[t", "behaviour_cloning", "t[0]"])
+def test_a_mask_that_does_not_parse_is_refused_at_once(name, text):
+    with pytest.raises(MaskError) as raised:
+        make(**{name: text})
+    assert text in str(raised.value)
+
+
+def test_windows_are_k_steps_from_the_sampled_frame_on():
+    config = make(context_length=4)
+    assert config.observation_delta_indices == config.action_delta_indices == [0, 1, 2, 3]
+    assert config.reward_delta_indices is None
+    assert config.drop_n_last_frames == 3
+    assert make(context_length=4, drop_n_last_frames=0).drop_n_last_frames == 0
+
+
+def test_presets():
+    config = make(optimizer_lr=3e-4, scheduler_warmup_steps=7)
+    assert config.get_optimizer_preset().lr == 3e-4
+    assert config.get_scheduler_preset().num_warmup_steps == 7
+
+
+# --- A dataset's features --------------------------------------------------------------------------------------------
+
+ENTRIES = {
+    "observation.state": {"dtype": "int64", "shape": (2,), "names": ["agent", "key"], "categories": [16, 16]},
+    "observation.environment_state": {"dtype": "float32", "shape": (3,), "names": None},
+    "observation.visits_corner": {"dtype": "float32", "shape": (1,), "names": None},
+    "observation.images.top": {"dtype": "video", "shape": (8, 8, 3), "names": ["height", "width", "channels"]},
+    "observation.text": {"dtype": "string", "shape": (1,), "names": None},
+    "action": {"dtype": "float32", "shape": [2], "names": {"motors": ["x", "y"]}},
+    "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": ["return_to_go"]},
+    "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    "timestamp": {"dtype": "float32", "shape": (1,), "names": None},
+    "index": {"dtype": "int64", "shape": (1,), "names": None},
+}
+
+
+def test_factors_are_read_off_a_dataset():
+    config = make()
+    config.set_dataset_feature_metadata(ENTRIES)
+    assert config.features == {
+        "s": [Feature("observation.state", 2, [16, 16]), Feature("observation.environment_state", 3)],
+        "a": [Feature("action", 2)],
+        "rtg": [Feature("observation.return_to_go", 1)],
+    }
+    assert config.features["s"][0].names == ["agent", "key"]
+
+
+def test_a_checkpoint_goes_on_with_the_same_features_alone():
+    config = make()
+    config.set_dataset_feature_metadata(ENTRIES)
+    config.set_dataset_feature_metadata(ENTRIES)
+    renamed = ENTRIES | {"observation.state": ENTRIES["observation.state"] | {"names": None}}
+    config.set_dataset_feature_metadata(renamed)  # names are for people
+    other = ENTRIES | {"observation.state": ENTRIES["observation.state"] | {"categories": [16, 9]}}
+    with pytest.raises(ValueError, match=r"other features.*\n.*categories \[16, 16\].*\n.*categories \[16, 9\]"):
+        config.set_dataset_feature_metadata(other)
+
+
+def test_categories_must_be_as_many_as_numbers():
+    wrong = ENTRIES | {"observation.state": ENTRIES["observation.state"] | {"categories": [16]}}
+    with pytest.raises(ValueError, match=r"observation\.state has 2 numbers and 1 categories"):
+        make().set_dataset_feature_metadata(wrong)
+
+
+@pytest.mark.parametrize("key", ["action", "observation.state"])
+def test_states_and_actions_are_needed(key):
+    entries = {name: entry for name, entry in ENTRIES.items() if name not in (key, "observation.environment_state")}
+    with pytest.raises(ValueError, match=f"no '{key}'"):
+        make().set_dataset_feature_metadata(entries)
+
+
+def test_declared_features_serve_where_no_dataset_was_read():
+    config = make(
+        input_features={
+            "observation.state": PolicyFeature(FeatureType.STATE, (3,)),
+            "observation.images.top": PolicyFeature(FeatureType.VISUAL, (3, 8, 8)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    config.validate_features()
+    assert config.features == {"s": [Feature("observation.state", 3)], "a": [Feature("action", 2)]}
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (9,))}
+    config.validate_features()  # as at evaluation: what is known stays
+    assert config.features["a"] == [Feature("action", 2)]
+
+
+# --- The command line and config.json --------------------------------------------------------------------------------
+
+MASKS = [
+    ("past", "past"),
+    ("a[t] | s[:t+1], a[:t]", "a[t] | s[:t+1], a[:t]"),
+    ('["behavior_cloning", "s[1] | s[0], a[0]"]', ["behavior_cloning", "s[1] | s[0], a[0]"]),
+    ('{"past": 1, "random_mask": 2.5}', {"past": 1.0, "random_mask": 2.5}),
+]
+
+
+@pytest.mark.parametrize(("argument", "value"), MASKS)
+def test_training_masks_on_the_command_line(argument, value):
+    assert parse(f"--training_masks={argument}").training_masks == value
+
+
+def test_given_on_the_command_line():
+    config = parse('--given={"s[-1]": [15, 15], "a[0]": 2, "s[3]": [[1, 2], [3, 4]]}', "--target_return=5")
+    assert config.given == {"s[-1]": [15, 15], "a[0]": 2, "s[3]": [[1, 2], [3, 4]]}
+    assert config.target_return == 5
+
+
+@pytest.mark.parametrize("text", ["a[t] | s[:t+1], a[:t], s[-1]", "goal_conditioned"])
+def test_inference_mask_on_the_command_line(text):
+    assert parse(f"--inference_mask={text}").inference_mask == text
+
+
+@pytest.mark.parametrize(("_", "masks"), MASKS)
+def test_config_json_gives_the_settings_back(tmp_path, _, masks):
+    given = {"s[-1]": [15, 14.5], "a[0]": [[1.0], [2]], "rtg[0]": 4}
+    config = make(training_masks=masks, given=given, loss_weights={"s": 0.5})
+    config.set_dataset_feature_metadata(ENTRIES)
+    config._save_pretrained(tmp_path)
+    loaded = PreTrainedConfig.from_pretrained(tmp_path)
+    assert isinstance(loaded, UniMASKConfig)
+    assert loaded == config
+    assert loaded.training_masks == masks
+    assert loaded.features["s"][0].names == ["agent", "key"]
+    assert json.loads((tmp_path / "config.json").read_text())["training_masks"] == masks
+
+
+def test_settings_can_be_changed_where_a_checkpoint_is_loaded(tmp_path):
+    make(training_masks=["past", "future"])._save_pretrained(tmp_path)
+    changed = PreTrainedConfig.from_pretrained(
+        tmp_path, cli_overrides=["--training_masks=random_mask", '--given={"s[-1]": [1, 2]}', "--sample_actions=true"]
+    )
+    assert (changed.training_masks, changed.given, changed.sample_actions) == ("random_mask", {"s[-1]": [1, 2]}, True)

@@ -1,0 +1,121 @@
+"""The loss against a loop over tokens."""
+
+import math
+
+import pytest
+import torch
+
+from lerobot_unimask.losses import component_loss, masked_losses
+from lerobot_unimask.window import Feature, Window, make_factors
+
+B, K = 5, 4
+FEATURES = {
+    "s": [Feature("observation.state", 2, [5, 3]), Feature("observation.environment_state", 3)],
+    "a": [Feature("action", 2)],
+}
+FACTORS = make_factors(FEATURES)
+
+
+@pytest.fixture
+def question():
+    return make_question(FACTORS)
+
+
+def make_question(factors):
+    """(predictions, window, predict)"""
+    generator = torch.Generator().manual_seed(0)
+    cells = torch.stack([torch.randint(0, n, (B, K), generator=generator) for n in (5, 3)], dim=-1)
+    values = {
+        "s": torch.cat([cells.float(), torch.randn(B, K, 3, generator=generator)], dim=-1),
+        "a": torch.randn(B, K, 2, generator=generator),
+    }
+    predictions = {
+        name: [torch.randn(B, K, c.size, generator=generator).requires_grad_() for c in factor.components]
+        for name, factor in factors.items()
+    }
+    predict = {name: torch.rand(B, K, generator=generator) < 0.4 for name in FACTORS}
+    return predictions, Window(values, torch.ones(B, K, dtype=torch.bool)), predict
+
+
+def slow_losses(predictions, window, predict, factors):
+    losses = {}
+    for name, factor in factors.items():
+        losses[name], count = 0.0, int(predict[name].sum())
+        for b in range(B):
+            for k in range(K):
+                if not predict[name][b, k]:
+                    continue
+                value = window.values[name][b, k].tolist()
+                for output, component in zip(predictions[name], factor.components, strict=True):
+                    numbers = output[b, k].tolist()
+                    target = value[component.dims]
+                    if component.discrete:
+                        cost = math.log(sum(math.exp(n) for n in numbers)) - numbers[int(target[0])]
+                    elif component.gaussian:
+                        means, logarithms = numbers[: len(target)], numbers[len(target) :]
+                        densities = [
+                            math.exp(-(((v - m) / math.exp(s)) ** 2) / 2) / math.sqrt(2 * math.pi) / math.exp(s)
+                            for m, s, v in zip(means, logarithms, target, strict=True)
+                        ]
+                        cost = -sum(map(math.log, densities)) / len(target)
+                    else:
+                        cost = sum((n - v) ** 2 for n, v in zip(numbers, target, strict=True)) / len(target)
+                    losses[name] += cost / count
+    return losses
+
+
+@pytest.mark.parametrize("gaussian", [False, True])
+def test_the_loss_is_that_of_a_loop_over_tokens(gaussian):
+    factors = make_factors(FEATURES, gaussian=gaussian)
+    question = make_question(factors)
+    fast = masked_losses(*question, factors)
+    for name, loss in slow_losses(*question, factors).items():
+        assert fast[name].item() == pytest.approx(loss, rel=1e-5)
+        assert loss > 0
+
+
+def test_a_gaussians_scale_is_bounded():
+    component = make_factors(FEATURES, gaussian=True)["a"].components[0]
+    value = torch.tensor([[[1.0, -1.0]]])
+    for log_scale in (-1e6, 1e6):
+        prediction = torch.tensor([[[1.0, -1.0, log_scale, log_scale]]], requires_grad=True)
+        loss = component_loss(prediction, value, component).sum()
+        loss.backward()
+        assert loss.isfinite()
+        assert prediction.grad.isfinite().all()
+
+
+def test_a_perfect_prediction_costs_nothing():
+    value = torch.tensor([[[2.0, 1.0, 0.5, -1.0, 3.0]]])
+    agent, _, numbers = FACTORS["s"].components
+    certain = torch.full((1, 1, 5), -100.0)
+    certain[..., 2] = 100.0
+    assert component_loss(certain, value, agent).item() == 0
+    assert component_loss(value[..., 2:], value, numbers).item() == 0
+    assert component_loss(torch.zeros(1, 1, 5), value, agent).item() == pytest.approx(math.log(5))
+
+
+def test_what_is_not_asked_does_not_matter_not_even_a_nan(question):
+    predictions, window, predict = question
+    loss = sum(masked_losses(predictions, window, predict, FACTORS).values())
+    outputs = [output for name in FACTORS for output in predictions[name]]
+    gradients = torch.autograd.grad(loss, outputs)
+    for wrong in (float("nan"), float("inf"), -3.0, 1e9):
+        values = {name: torch.where(predict[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
+        other = sum(masked_losses(predictions, Window(values, window.valid), predict, FACTORS).values())
+        assert torch.equal(other, loss)
+        for gradient, expected in zip(torch.autograd.grad(other, outputs), gradients, strict=True):
+            assert torch.equal(gradient, expected)
+    for name in FACTORS:
+        for output in predictions[name]:
+            gradient = gradients[[output is o for o in outputs].index(True)]
+            assert torch.equal(gradient.abs().sum(-1) > 0, predict[name])
+
+
+def test_a_factor_that_is_not_asked_costs_zero_and_can_be_differentiated(question):
+    predictions, window, predict = question
+    losses = masked_losses(predictions, window, {**predict, "a": torch.zeros(B, K, dtype=torch.bool)}, FACTORS)
+    assert losses["a"].item() == 0
+    losses["a"].backward()
+    assert predictions["a"][0].grad.abs().sum() == 0
+    assert losses["s"] > 0

@@ -1,0 +1,222 @@
+"""What every network must keep: hidden values change nothing, shown ones do, windows do not see each other."""
+
+import math
+
+import pytest
+import torch
+
+from lerobot_unimask.losses import masked_losses
+from lerobot_unimask.networks.transformer import NumberEncoding, Transformer
+from lerobot_unimask.window import Feature, Window, make_factors
+
+B, K = 3, 5
+LAYOUTS = ("stacked", "separate", "stacked, plain inputs")
+KINDS = {
+    "discrete": {
+        "s": [Feature("observation.state", 2, [7, 4])],
+        "a": [Feature("action", 1, [3])],
+        "rtg": [Feature("observation.return_to_go", 1)],
+    },
+    "continuous": {"s": [Feature("observation.state", 3)], "a": [Feature("action", 2)]},
+    "mixed": {
+        "s": [Feature("observation.state", 2, [7, 4]), Feature("observation.environment_state", 2)],
+        "a": [Feature("action", 2)],
+        "rtg": [Feature("observation.return_to_go", 1)],
+        "corner": [Feature("observation.visits_corner", 1, [2])],
+    },
+}
+
+
+def make_network(kind, layout, dropout=0.0):
+    factors = make_factors(KINDS[kind])
+    torch.manual_seed(0)
+    network = Transformer(
+        factors,
+        context_length=K,
+        stacked="stacked" in layout,
+        fine_inputs="plain" not in layout,
+        width=16,
+        depth=2,
+        heads=2,
+        feedforward_width=16,
+        dropout=dropout,
+    )
+    return network.eval(), factors
+
+
+def random_window(factors, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    values = {}
+    for name, factor in factors.items():
+        parts = [
+            torch.randint(0, c.categories, (B, K, 1), generator=generator).float()
+            if c.discrete
+            else torch.randn(B, K, c.size, generator=generator)
+            for c in factor.components
+        ]
+        values[name] = torch.cat(parts, dim=-1)
+    return Window(values, torch.ones(B, K, dtype=torch.bool))
+
+
+def random_visible(factors, seed=1):
+    """As the language has it: of a property, at most the first step is shown."""
+    generator = torch.Generator().manual_seed(seed)
+    visible = {name: torch.rand(B, K, generator=generator) < 0.5 for name in factors}
+    for name in factors:
+        if name not in ("s", "a"):
+            visible[name][:, 1:] = False
+            visible[name][:, 0] = torch.tensor([True, False, True])
+    return visible
+
+
+def flat(predictions):
+    return torch.cat([output.flatten(1) for outputs in predictions.values() for output in outputs], dim=1)  # (B, ...)
+
+
+@pytest.fixture(params=list(KINDS))
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(params=LAYOUTS)
+def layout(request):
+    return request.param
+
+
+def test_one_output_for_each_component(kind, layout):
+    network, factors = make_network(kind, layout)
+    predictions = network(random_window(factors), random_visible(factors))
+    assert list(predictions) == ["s", "a"]
+    for name, outputs in predictions.items():
+        assert [tuple(o.shape) for o in outputs] == [(B, K, c.size) for c in factors[name].components]
+
+
+def test_a_hidden_value_changes_nothing_not_even_a_nan(kind, layout):
+    network, factors = make_network(kind, layout)
+    window, visible = random_window(factors), random_visible(factors)
+    expected = flat(network(window, visible))
+    for wrong in (float("nan"), float("inf"), -1e9, 1.0):
+        values = {name: torch.where(visible[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
+        assert torch.equal(flat(network(Window(values, window.valid), visible)), expected)
+
+
+def test_a_nan_in_a_hidden_place_spoils_no_gradient(kind, layout):
+    network, factors = make_network(kind, layout)
+    window, visible = random_window(factors), random_visible(factors)
+    values = {name: torch.where(visible[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()}
+    flat(network(Window(values, window.valid), visible)).square().mean().backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_every_shown_value_changes_every_prediction_of_its_window_and_no_others(kind, layout):
+    network, factors = make_network(kind, layout)
+    window, visible = random_window(factors), random_visible(factors)
+    before = network(window, visible)
+    for name, shown in visible.items():
+        for b, k in shown.nonzero().tolist():
+            for component in factors[name].components:
+                values = {other: value.clone() for other, value in window.values.items()}
+                cell = values[name][b, k, component.dims]
+                cell.copy_((cell + 1) % component.categories if component.discrete else cell + 1)
+                after = network(Window(values, window.valid), visible)
+                for asked in ("s", "a"):
+                    for old, new in zip(before[asked], after[asked], strict=True):
+                        changed = (old != new).any(-1)  # (B, K): attention reaches every step, both ways
+                        assert changed[b].all()
+                        assert not changed[[i for i in range(B) if i != b]].any()
+
+
+def test_hidden_is_not_zero(kind, layout):
+    network, factors = make_network(kind, layout)
+    window = random_window(factors)
+    zero = Window({name: torch.zeros_like(value) for name, value in window.values.items()}, window.valid)
+    everything = {name: torch.ones(B, K, dtype=torch.bool) for name in factors}
+    for name in factors:
+        less = everything | {name: torch.zeros(B, K, dtype=torch.bool)}
+        assert not torch.equal(flat(network(zero, everything)), flat(network(zero, less)))
+
+
+def test_a_windows_answer_is_its_own(kind, layout):
+    network, factors = make_network(kind, layout)
+    window, visible = random_window(factors), random_visible(factors)
+    together = flat(network(window, visible))
+    for b in range(B):
+        alone = Window({name: value[b : b + 1] for name, value in window.values.items()}, window.valid[b : b + 1])
+        output = flat(network(alone, {name: shown[b : b + 1] for name, shown in visible.items()}))
+        torch.testing.assert_close(output[0], together[b], rtol=1e-5, atol=1e-6)
+
+
+def test_steps_are_told_apart(kind, layout):
+    network, factors = make_network(kind, layout)
+    window = random_window(factors)
+    nothing = {name: torch.zeros(B, K, dtype=torch.bool) for name in factors}
+    for outputs in network(window, nothing).values():
+        for output in outputs:
+            assert all(not torch.equal(output[0, i], output[0, j]) for i in range(K) for j in range(i))
+
+
+def test_dropout_is_for_training_alone(kind, layout):
+    network, factors = make_network(kind, layout, dropout=0.5)
+    window, visible = random_window(factors), random_visible(factors)
+    assert torch.equal(flat(network(window, visible)), flat(network(window, visible)))
+    network.train()
+    assert not torch.equal(flat(network(window, visible)), flat(network(window, visible)))
+
+
+def test_number_encodings_are_those_of_a_loop_over_tokens():
+    generator = torch.Generator().manual_seed(0)
+    value = torch.randn(20, 6, 2, generator=generator)
+    visible = torch.rand(20, 6, generator=generator) < 0.6
+    encoding = NumberEncoding(2, fine=True)
+    encoded = encoding(torch.where(visible.unsqueeze(-1), value, 0.0), visible)
+    assert encoded.shape == (20, 6, encoding.size)
+    for b in range(20):
+        previous = None
+        for k in range(6):
+            if not visible[b, k]:
+                continue
+            numbers = value[b, k].tolist()
+            angles = [number * math.pi / 2 * 2**octave for number in numbers for octave in range(4)]
+            moved, exists = [0.0] * 8, 0.0
+            if previous is not None:
+                speed = ((value[b, k] - value[b, previous]) / (k - previous)).tolist()
+                moved, exists = [math.tanh(s * 4**scale) for s in speed for scale in range(4)], 1.0
+            expected = [*numbers, *map(math.sin, angles), *map(math.cos, angles), *moved, exists]
+            torch.testing.assert_close(encoded[b, k], torch.tensor(expected), rtol=1e-4, atol=1e-5)
+            previous = k
+    plain = NumberEncoding(2, fine=False)
+    assert plain.size == 2
+    assert torch.equal(plain(value, visible), value)
+
+
+def test_the_network_learns_what_a_mask_hides():
+    """Forward dynamics of a ring, s[k + 1] = (s[k] + 1) mod 7, from one shown state: model and loss together."""
+    torch.manual_seed(0)
+    factors = make_factors({"s": [Feature("observation.state", 1, [7])], "a": [Feature("action", 1)]})
+    network = Transformer(
+        factors,
+        context_length=K,
+        stacked=True,
+        width=32,
+        depth=1,
+        heads=2,
+        feedforward_width=32,
+        dropout=0.0,
+        fine_inputs=False,
+    )
+    starts = torch.arange(7)
+    states = ((starts[:, None] + torch.arange(K)) % 7).float().unsqueeze(-1)  # (7, K, 1)
+    window = Window({"s": states, "a": torch.zeros(7, K, 1)}, torch.ones(7, K, dtype=torch.bool))
+    first = (torch.arange(K) == 0).expand(7, K)
+    visible = {"s": first, "a": torch.zeros_like(first)}
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
+    for _ in range(250):
+        loss = masked_losses(network(window, visible), window, {"s": ~first, "a": visible["a"]}, factors)["s"]
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert loss < 0.05  # chance is ln 7 = 1.95
+    assert torch.equal(network(window, visible)["s"][0].argmax(-1)[:, 1:], states[:, 1:, 0].long())
