@@ -1,5 +1,6 @@
 """The policy's one config dataclass, `--policy.type=unimask`."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -103,8 +104,8 @@ class UniMASKConfig(PreTrainedConfig):
             raise ValueError(f"dropout is {self.dropout}; it must lie in [0, 1).")
         if isinstance(self.target_return, str) and self.target_return != "auto":
             raise ValueError(f"target_return is {self.target_return!r}; give a number or auto.")
-        if self.target_return is not None and "rtg[0]" in self.given:
-            raise ValueError("target_return and given both name rtg[0]; give one of them.")
+        if isinstance(self.target_return, float) and not math.isfinite(self.target_return):
+            raise ValueError(f"target_return is {self.target_return}; give a finite number or auto.")
         # Syntax alone: which factors exist is known once the dataset or the checkpoint has been read.
         for text in mixture(self.training_masks):
             if text != RANDOM_MASK:

@@ -5,7 +5,7 @@ Acting is a question asked at every step, so everything here goes through `predi
 Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -154,9 +154,12 @@ def sample(
 
 
 def read_given(
-    given: Given, factors: Mapping[str, Factor], context_length: int, batch_size: int
+    given: Given, factors: Mapping[str, Factor], context_length: int, batch_size: int | None = None
 ) -> dict[tuple[str, int], Tensor]:
     """Check what a user gives: (factor, position) -> (B, D) or (1, D), D as the user counts it, without computed parts.
+
+    Args:
+        batch_size: B; None where it is not known yet, and any number of rows will do.
 
     Raises:
         MaskError: a key that is not a token of the window.
@@ -187,32 +190,58 @@ def give(
     return Window(values, window.valid), known
 
 
-def _token(text: str, value: Any, factor: Factor, B: int) -> Tensor:
+def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
     """(B, given_size) or (1, given_size), checked."""
     size = factor.given_size
     try:
         token = torch.as_tensor(value, dtype=torch.float32)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}.") from error
-    if token.ndim == 0 or (token.ndim == 1 and size == 1 and token.shape[0] == B):
+    if token.ndim == 0 or (token.ndim == 1 and size == 1 and token.shape[0] in (B or token.shape[0], 1)):
         token = token.reshape(-1, 1)
     elif token.ndim == 1:
         token = token.unsqueeze(0)
-    if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B):
+    if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B or token.shape[0]):
+        rows = "one such row for each" if B is None else f"one such row for each of the {B}"
         raise ValueError(
-            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or one such row for each of the {B} "
-            "environments."
+            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or {rows} windows or environments."
         )
-    if not token.isfinite().all():
-        raise ValueError(f"{text} is given {value!r}; its numbers must be finite.")
+    check_values(f"{text} is given {value!r}, which", token, factor)
+    return token
+
+
+def check_values(what: str, values: Tensor, factor: Factor) -> None:
+    """Values of a factor, (..., D) or without its computed numbers, must be finite, and categories where discrete.
+
+    Raises:
+        ValueError: they are not; names `what` and the first bad value.
+    """
+    fine = values.isfinite()
+    if not fine.all():
+        raise ValueError(f"{what} holds {values[~fine][0].item()}; its numbers must be finite.")
     for component in factor.components:
         if component.discrete:
-            numbers = token[:, component.dims]
-            if ((numbers < 0) | (numbers >= component.categories) | (numbers != numbers.round())).any():
+            numbers = values[..., component.dims]
+            bad = (numbers < 0) | (numbers >= component.categories) | (numbers != numbers.round())
+            if bad.any():
                 raise ValueError(
-                    f"{text} is given {value!r}; {component.name} is a category from 0 to {component.categories - 1}."
+                    f"{what} holds {numbers[bad][0].item():g}; {component.name} is a category from 0 to "
+                    f"{component.categories - 1}."
                 )
-    return token
+
+
+def check_shown(tokens: Iterable[tuple[str, int]], visible: Mapping[str, Tensor], text: str) -> None:
+    """A given token must be one that the mask shows, (..., K) bool for each factor, or giving it changes nothing.
+
+    Raises:
+        ValueError: the mask does not show it.
+    """
+    for name, step in tokens:
+        if not visible[name][..., step].any():
+            raise ValueError(
+                f"{name}[{step}] is given, but the mask does not show it:\n  {text}\n"
+                f"Add {name}[{step}] after the bar, or do not give it."
+            )
 
 
 def check_known(mask: Mask, known: Mapping[str, Tensor], text: str) -> None:

@@ -258,6 +258,19 @@ class MaskTable:
     predict: Tensor
     t: Tensor
 
+    @property
+    def shows(self) -> dict[str, Tensor]:
+        """factor -> (K,) bool: tokens shown by some row."""
+        return dict(zip(self.factors, self.visible.any(0), strict=True))
+
+    @property
+    def shows_ahead(self) -> dict[str, Tensor]:
+        """factor -> (K,) bool: tokens shown by some row before a rollout at its t can have observed them."""
+        steps, t = torch.arange(self.visible.shape[-1]), self.t[:, None]
+        ahead = {"s": steps > t, "a": steps >= t}  # (R, K); a property is never observed
+        always = torch.ones_like(steps > t)
+        return {name: (self.visible[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
+
     def at(self, t: int | None, batch_size: int = 1) -> "Mask":
         """The mask at step t for each window of a batch.
 
@@ -495,11 +508,11 @@ def mixture(masks: str | Sequence[str] | Mapping[str, float]) -> dict[str, float
     """
     if isinstance(masks, str):
         masks = [masks]
-    weights = dict(masks) if isinstance(masks, Mapping) else {text: 1.0 for text in masks}
+    weights = list(masks.items()) if isinstance(masks, Mapping) else [(text, 1.0) for text in masks]
     if not weights:
         raise ValueError(f"training_masks is empty; name a question or a task: {', '.join([*TASKS, RANDOM_MASK])}.")
     expanded: dict[str, float] = {}
-    for text, weight in weights.items():
+    for text, weight in weights:
         if not isinstance(weight, int | float) or not 0 < weight < float("inf"):
             raise ValueError(f"training_masks gives {text!r} the weight {weight!r}; weights are positive numbers.")
         members = REGIMES.get(text, (text,))

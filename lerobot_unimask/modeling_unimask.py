@@ -1,7 +1,8 @@
 """UniMASKPolicy: the masked model behind LeRobot's policy contract, and the questions that one can ask it."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,6 @@ class UniMASKPolicy(PreTrainedPolicy):
         config: UniMASKConfig,
         dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
-        **_: Any,
     ) -> None:
         super().__init__(config)
         config.validate_features()
@@ -101,7 +101,23 @@ class UniMASKPolicy(PreTrainedPolicy):
                 f"target_return is {self.config.target_return}, but this model has no return factor: its dataset has "
                 "no 'observation.return_to_go'."
             )
-        self._acting_table(self.config.inference_mask)
+        for name, weight in self.config.loss_weights.items():
+            if not 0 <= weight < float("inf"):
+                raise ValueError(f"loss_weights gives {name} the weight {weight}; weights are numbers from 0 on.")
+        table = self._acting_table(self.config.inference_mask)
+        tokens = list(inference.read_given(self.config.given, self.factors, self.config.context_length))
+        if self.config.target_return is not None:
+            if ("rtg", 0) in tokens:
+                raise ValueError("target_return and given both name rtg[0]; give one of them.")
+            tokens.append(("rtg", 0))
+        inference.check_shown(tokens, table.shows, self.config.inference_mask)
+        for name, step in tokens:
+            if not table.shows_ahead[name][step]:
+                logger.warning(
+                    "%s[%d] is given, but the inference mask shows it only when it has been observed: it changes nothing.",
+                    name,
+                    step,
+                )
 
     # --- Training ----------------------------------------------------------------------------------------------------
 
@@ -122,7 +138,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         predictions = self.network(window, mask.visible)
         losses = masked_losses(predictions, window, mask.predict, self.factors)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
-        return loss, {f"loss_{name}": part.item() for name, part in losses.items()}
+        parts = torch.stack(list(losses.values())).tolist()  # one synchronisation with the device, not one for each
+        return loss, {f"loss_{name}": part for name, part in zip(losses, parts, strict=True)}
 
     def update(self) -> None:
         """Count an update; LeRobot calls this after each optimiser step."""
@@ -160,7 +177,8 @@ class UniMASKPolicy(PreTrainedPolicy):
                 everything shown is in `given`. Not changed.
             mask: a question, the name of a task, or a Mask.
             t: the step that the question is about, where it has a t.
-            given: values of single tokens, {"s[-1]": [15, 15], "rtg[0]": 5}, instead of the recorded ones.
+            given: values of single tokens, {"s[-1]": [15, 15], "rtg[0]": 5}, instead of the recorded ones. Steps past
+                a recorded episode's end stay hidden all the same.
 
         Raises:
             MaskError: the question does not fit the model, or not this t.
@@ -207,9 +225,13 @@ class UniMASKPolicy(PreTrainedPolicy):
         K = self.config.context_length
         recorded = window is not None
         if window is None:
-            window = RolloutMemory(self.factors, K, 1, self.device).window(self.statistics.horizon)  # empty
+            rows = (len(token) for token in inference.read_given(given or {}, self.factors, K).values())
+            empty = RolloutMemory(self.factors, K, max(rows, default=1), self.device)
+            window = empty.window(self.statistics.horizon)
         elif not isinstance(window, Window):
             window = self.make_window(window)
+        if window.valid.shape[1] != K:
+            raise ValueError(f"The window has {window.valid.shape[1]} steps; this model's have {K}.")
         window = window.to(self.device)
         batch_size = len(window.valid)
         tokens = inference.read_given(given or {}, self.factors, K, batch_size)
@@ -221,8 +243,12 @@ class UniMASKPolicy(PreTrainedPolicy):
             text = mask.draw()
         else:
             text, mask = mask, self._table(mask).at(t, batch_size)
+        inference.check_shown(tokens, mask.visible, text)
         inference.check_known(mask, known, text)
-        return window, mask.to(self.device).within(window.valid)
+        mask = mask.to(self.device).within(window.valid)
+        for name, value in window.values.items():
+            inference.check_values(f"A shown token of {name}", value[mask.visible[name]], self.factors[name])
+        return window, mask
 
     def _table(self, text: str) -> MaskTable:
         return tabulate(text, tuple(self.factors), self.config.context_length)
@@ -254,7 +280,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         mask: str | None = None,
         given: Given | None = None,
         sample: bool | None = None,
-        **_: Any,
+        generator: torch.Generator | None = None,
     ) -> Tensor:
         """One action for each environment: the answer to the inference mask at the present step.
 
@@ -264,13 +290,14 @@ class UniMASKPolicy(PreTrainedPolicy):
             mask: this step's question, instead of `inference_mask`.
             given: values of window positions, instead of the config's; what has been observed wins over them.
             sample: draw the action instead of taking the most likely one; None: as `sample_actions` says.
+            generator: to draw with; None: torch's global one, which lerobot-eval seeds.
 
         Returns:
             (B, D) in the dataset's units: int64 category numbers, or float32.
 
         Raises:
             MaskError: the mask does not ask for a[t] or does not fit the model.
-            ValueError: the mask shows a later token that nobody gives.
+            ValueError: the mask shows a later token that nobody gives, or not one that is given; a value is not legal.
         """
         state = self._state(batch)
         memory = self._memory
@@ -280,11 +307,14 @@ class UniMASKPolicy(PreTrainedPolicy):
         table = self._acting_table(text)
         so_far = batch.get(RETURN_SO_FAR)
         memory.observe(state, so_far.to(self.device).reshape(-1) if so_far is not None else None)
-        given = self.config.given if given is None else given
-        tokens = inference.read_given(given, self.factors, self.config.context_length, len(state))
         if memory.step == 0:
             memory.target_return = self._choose_target(state)
-        if "rtg" in self.factors:
+        tokens = inference.read_given(
+            self.config.given if given is None else given, self.factors, self.config.context_length, len(state)
+        )
+        if given is not None:  # the config's may go unused by a question that is asked in passing
+            inference.check_shown(tokens, table.shows, text)
+        if "rtg" in self.factors and table.shows["rtg"][0]:
             target = tokens.get(("rtg", 0), memory.target_return)
             if target is not None:
                 tokens["rtg", 0] = memory.remaining(target.to(self.device))
@@ -294,7 +324,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         with _evaluation(self):
             answer = inference.answer(self.network, self.statistics, self.factors, window, posed.to(self.device))
         chosen = self.config.sample_actions if sample is None else sample
-        parts = [d.draw(None) if chosen else d.most_likely for d in answer["a"]]
+        parts = [d.draw(generator) if chosen else d.most_likely for d in answer["a"]]
         action = torch.cat(parts, dim=-1)[:, memory.position]  # (B, D)
         memory.act(action)
         discrete = all(component.discrete for component in self.factors["a"].components)
@@ -327,7 +357,9 @@ class UniMASKPolicy(PreTrainedPolicy):
                     f"the environment gives {found} under that name."
                 )
             parts.append(value.to(self.device, torch.float32))
-        return torch.cat(parts, dim=-1)
+        state = torch.cat(parts, dim=-1)
+        inference.check_values("The observed state", state, self.factors["s"])
+        return state
 
     # --- Checkpoints -------------------------------------------------------------------------------------------------
 
@@ -380,20 +412,15 @@ class UniMASKPolicy(PreTrainedPolicy):
         return model
 
 
-class _evaluation:
+@contextmanager
+def _evaluation(policy: UniMASKPolicy) -> Iterator[None]:
     """Answers are given without dropout, also while the policy is being trained."""
-
-    def __init__(self, policy: torch.nn.Module):
-        self.policy = policy
-
-    def __enter__(self) -> None:
-        self.was_training = self.policy.training
-        if self.was_training:
-            self.policy.eval()
-
-    def __exit__(self, *_: Any) -> None:
-        if self.was_training:
-            self.policy.train()
+    was_training = policy.training
+    policy.eval()
+    try:
+        yield
+    finally:
+        policy.train(was_training)
 
 
 def _index(batch: Mapping[str, Tensor], window: Window) -> Tensor:

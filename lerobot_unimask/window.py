@@ -193,7 +193,7 @@ class Statistics(nn.Module):
         """Take over a dataset's statistics, as `LeRobotDatasetMetadata.stats` holds them.
 
         Raises:
-            KeyError: a continuous feature has no mean and standard deviation there.
+            ValueError: a continuous feature has no mean and standard deviation there.
         """
         for name, columns in self.features.items():
             mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
@@ -203,10 +203,12 @@ class Statistics(nn.Module):
                 start += feature.size
                 if feature.categories is None:
                     if feature.key not in dataset_stats:
-                        raise KeyError(f"The dataset's statistics lack {feature.key!r}: recompute them with LeRobot.")
+                        raise ValueError(f"The dataset's statistics lack {feature.key!r}: recompute them with LeRobot.")
                     mean[dims] = _numbers(dataset_stats[feature.key]["mean"])
                     deviation = _numbers(dataset_stats[feature.key]["std"])
-                    std[dims] = torch.where(deviation > 0, deviation, 1.0)  # a constant is only shifted
+                    std[dims] = torch.where(
+                        deviation > 1e-6 * (1 + mean[dims].abs()), deviation, 1.0
+                    )  # constants are only shifted
         if "frame_index" in dataset_stats and "timestamp" in dataset_stats:
             last = _numbers(dataset_stats["frame_index"]["max"])
             self.horizon.fill_(last.item() + 1)

@@ -32,7 +32,6 @@ def parse(*arguments):
         ({"width": 10, "heads": 4}, r"width \(10\) must be a multiple of heads \(4\)"),
         ({"dropout": 1.0}, "dropout is 1.0"),
         ({"dropout": -0.1}, "dropout is -0.1"),
-        ({"target_return": 5.0, "given": {"rtg[0]": 4.0}}, "both name rtg"),
         ({"training_masks": []}, "training_masks is empty"),
         ({"training_masks": {"past": -1.0}}, "weights are positive"),
     ],

@@ -249,7 +249,7 @@ def test_given_values_may_be_shared_or_one_for_each_environment():
         ("s[0]", [1], "give 2 numbers"),
         ("s[0]", [1, 2, 3], "give 2 numbers"),
         ("s[0]", 1, "give 2 numbers"),
-        ("s[0]", [[1, 2], [3, 4]], "for each of the 3 environments"),
+        ("s[0]", [[1, 2], [3, 4]], "for each of the 3 windows"),
         ("s[0]", [[[1, 2]]], "give 2 numbers"),
         ("s[0]", [], "give 2 numbers"),
         ("s[0]", "there", "give 2 numbers"),

@@ -873,3 +873,109 @@ def test_a_checkpoint_says_what_it_is_in_plain_json(tiny_policy, tmp_path):
     assert stored["features"]["s"] == [
         {"key": "observation.state", "size": 2, "categories": [16, 16], "names": ["agent_cell", "key_cell"]}
     ]
+
+
+# --- What is given and what is asked belong together -----------------------------------------------------------------
+
+
+def test_given_and_target_return_cannot_both_name_the_return(tiny_policy):
+    with pytest.raises(ValueError, match="both name rtg"):
+        tiny_policy(inference_mask="reward_conditioned", target_return=5.0, given={"rtg[0]": 4.0})
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"target_return": 6.0},
+        {"given": {"rtg[0]": 6.0}},
+        {"inference_mask": "a[t] | s[t]", "given": {"rtg[0]": 6.0}},
+    ],
+)
+def test_a_value_that_the_inference_mask_never_shows_is_refused_when_the_policy_is_made(tiny_policy, settings):
+    with pytest.raises(ValueError, match=r"is given, but the mask does not show it"):
+        tiny_policy(**settings)
+
+
+def test_a_value_that_is_observed_before_it_is_shown_is_said_to_change_nothing(tiny_policy, caplog):
+    tiny_policy(given={"s[-1]": [15, 15]})  # behaviour cloning shows the last state once it is there
+    assert "s[9] is given, but the inference mask shows it only when it has been observed" in caplog.text
+    caplog.clear()
+    tiny_policy(inference_mask="goal_conditioned", given={"s[-1]": [15, 15]})
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"q[0]": 1}, "no factor 'q'"),
+        ({"s[-1]": [1]}, "give 2 numbers"),
+        ({"s[-1]": [1, 99]}, "a category from 0 to 15"),
+        ({"s[99]": [1, 1]}, "outside the window"),
+    ],
+)
+def test_a_bad_given_is_refused_when_the_policy_is_made(tiny_policy, given, message):
+    with pytest.raises(ValueError, match=message):
+        tiny_policy(inference_mask="goal_conditioned", given=given)
+
+
+def test_a_value_given_in_passing_must_be_shown_but_the_configs_may_rest(tiny_policy):
+    policy = tiny_policy(inference_mask="goal_conditioned", given={"s[-1]": [15, 15]})
+    state = {"observation.state": torch.tensor([[5.0, 0.0]])}
+    assert policy.select_action(state, mask="a[t] | s[t]").shape == (1, 1)
+    with pytest.raises(ValueError, match="mask does not show it"):
+        policy.select_action(state, mask="behavior_cloning", given={"rtg[0]": 3})
+    with pytest.raises(ValueError, match="mask does not show it"):
+        policy.infer(None, "s[1] | s[0]", given={"s[0]": [5, 0], "s[4]": [5, 0]})
+
+
+def test_unknown_arguments_of_select_action_are_refused(tiny_policy):
+    with pytest.raises(TypeError, match="maks"):
+        tiny_policy().select_action({"observation.state": torch.zeros(1, 2)}, maks="past")
+
+
+@pytest.mark.parametrize("state", [[[16.0, 0.0]], [[float("nan"), 0.0]], [[1.5, 0.0]], [[-1.0, 0.0]]])
+def test_an_illegal_observation_is_refused_by_name(tiny_policy, state):
+    with pytest.raises(ValueError, match="observed state holds"):
+        tiny_policy().select_action({"observation.state": torch.tensor(state)})
+
+
+def test_samples_of_a_window_stand_together_and_given_rows_make_a_batch(tiny_policy):
+    policy = tiny_policy()
+    drawn = policy.sample(None, "s[1], a[0] | s[0]", given={"s[0]": [[5, 0], [9, 4]]}, samples=3)
+    assert drawn.values["s"][:, 0].tolist() == [[5, 0]] * 3 + [[9, 4]] * 3
+    assert not drawn.values["s"][:, 1].isnan().any()
+    assert drawn.values["s"][:, 2].isnan().all()
+
+
+def test_the_automatic_target_is_what_the_nearest_training_episode_returned(tiny_policy):
+    policy = tiny_policy(inference_mask="reward_conditioned", target_return="auto", target_return_scale=2.0)
+    with pytest.raises(ValueError, match="keeps no"):
+        policy.select_action({"observation.state": torch.tensor([[5.0, 0.0]])})
+    policy.reset()
+    policy.episode_starts.fill(torch.tensor([[5.0, 0.0], [12.0, 1.0]]), torch.tensor([3.0, -1.0]))
+    policy.select_action({"observation.state": torch.tensor([[11.0, 1.0], [5.0, 1.0]])})
+    assert policy._memory.target_return.tolist() == [[-2.0], [6.0]]
+    policy.reset()
+    policy.target_return = lambda state: state.sum(1)
+    policy.select_action({"observation.state": torch.tensor([[11.0, 1.0], [5.0, 1.0]])})
+    assert policy._memory.target_return.tolist() == [[12.0], [6.0]]
+
+
+def test_a_checkpoint_keeps_how_its_training_episodes_began(tmp_path, doorkey_root, tiny_policy):
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.factory import make_policy
+
+    meta = LeRobotDatasetMetadata("local/doorkey", root=doorkey_root)
+    config = tiny_policy(target_return="auto", inference_mask="reward_conditioned").config
+    config.features = {}
+    make_policy(config, ds_meta=meta).save_pretrained(tmp_path)
+    loaded = UniMASKPolicy.from_pretrained(tmp_path)
+    dataset = LeRobotDataset("local/doorkey", root=doorkey_root)
+    firsts = [dataset[start] for start in meta.episodes["dataset_from_index"]]
+    torch.testing.assert_close(
+        loaded.episode_starts.states, torch.stack([f["observation.state"] for f in firsts]).float()
+    )
+    torch.testing.assert_close(
+        loaded.episode_starts.returns, torch.stack([f["observation.return_to_go"] for f in firsts]).flatten()
+    )

@@ -186,7 +186,7 @@ def test_statistics_are_kept_with_the_weights():
 
 
 def test_missing_statistics_are_named():
-    with pytest.raises(KeyError, match=r"lack 'action'"):
+    with pytest.raises(ValueError, match=r"lack 'action'"):
         make_statistics().fill({key: value for key, value in STATS.items() if key != "action"})
 
 

@@ -27,7 +27,13 @@ logger = logging.getLogger(__name__)
 
 
 def first_windows(policy: UniMASKPolicy, root: Path, repo_id: str) -> dict[str, Tensor]:
-    """The window at each episode's first step, as one LeRobot batch, (E, K, ...)."""
+    """The window at each episode's first step, as one LeRobot batch, (E, K, ...).
+
+    Raises:
+        FileNotFoundError: there is no dataset in `root`. (LeRobot would ask the Hub for it.)
+    """
+    if not (root / "meta" / "info.json").exists():
+        raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
     meta = LeRobotDatasetMetadata(repo_id, root=root)
     deltas = resolve_delta_timestamps(policy.config, meta)
     dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=deltas)

@@ -59,8 +59,9 @@ class FactorEmbedding(nn.Module):
         continuous = [i for c in factor.components if not c.discrete for i in range(c.dims.start, c.dims.stop)]
         self.continuous = continuous
         self.categories = nn.ModuleList(nn.Embedding(count, width) for count in self.discrete.values())
-        self.encoding = NumberEncoding(len(continuous), fine=fine_inputs)
-        self.numbers = nn.Linear(self.encoding.size, width) if continuous else None
+        if continuous:
+            self.encoding = NumberEncoding(len(continuous), fine=fine_inputs)
+            self.numbers = nn.Linear(self.encoding.size, width)
         self.hidden = nn.Parameter(torch.randn(width))
 
     def forward(self, value: Tensor, visible: Tensor) -> Tensor:
@@ -69,7 +70,7 @@ class FactorEmbedding(nn.Module):
         # Replaced before it is embedded, so that not even a NaN in a hidden place can reach the network.
         value = torch.where(shown, value, 0.0)
         parts = [table(value[..., i].long()) for i, table in zip(self.discrete, self.categories, strict=True)]
-        if self.numbers is not None:
+        if self.continuous:
             parts.append(self.numbers(self.encoding(value[..., self.continuous], visible)))
         return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
 

@@ -1,0 +1,159 @@
+"""The command line: what it says, and that bad input ends in one clear line with nothing lost."""
+
+from pathlib import Path
+
+import pytest
+
+import dataset_builders.doorkey
+import dataset_builders.writer
+from lerobot_unimask import cli
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder, with its contents."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]):
+    """refused("build", ...) -> what the command says on standard error as it ends with status 2."""
+
+    def run(*arguments: str | Path) -> str:
+        with pytest.raises(SystemExit) as ended:  # any other exception would be a traceback for the user
+            cli.main([str(argument) for argument in arguments])
+        assert ended.value.code == 2
+        return capsys.readouterr().err
+
+    return run
+
+
+# --- Asking for it ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--help"], ["build", "demo", "validate", "lerobot-train", "lerobot-eval"]),
+        (["build", "--help"], ["doorkey"]),
+        (["build", "doorkey", "--help"], ["--episodes", "--seed", "--root", "--repo_id", "--expert", "default: 500"]),
+        (["demo", "--help"], ["--output", "--steps"]),
+        (["validate", "--help"], ["--run", "--dataset.root", "--output"]),
+    ],
+    ids=lambda value: " ".join(value) if value[-1] == "--help" else "",
+)
+def test_help_names_what_there_is(arguments, words, capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert not ended.value.code
+    said = capsys.readouterr().out
+    assert [word for word in words if word not in said] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "required: COMMAND"),
+        (["biuld"], "invalid choice: 'biuld'"),
+        (["build"], "required: ENVIRONMENT"),
+        (["build", "doorkeys"], "invalid choice: 'doorkeys'"),
+        (["build", "doorkey"], "required: --root"),
+        (["build", "doorkey", "--root=d", "--episode=3"], "Did you mean --episodes?"),
+        (["build", "doorkey", "--root=d", "--sed=3"], "Did you mean --seed?"),
+        (["build", "doorkey", "--root=d", "--xyzzy"], "This command knows"),
+        (["build", "doorkey", "--root=d", "--episodes=0"], "'0' is not a whole number of at least 1"),
+        (["build", "doorkey", "--root=d", "--episodes=few"], "'few' is not a whole number of at least 1"),
+        (["build", "doorkey", "--root=d", "--expert=best"], "choose from"),
+        (["build", "doorkey", "--root=d", "--seed=-1"], "seed at least 0"),
+        (["demo", "--ouput=d"], "Did you mean --output?"),
+        (["validate", "--dataset.root=d"], "required: --run"),
+        (["validate", "--run=r"], "required: --dataset.root"),
+        (["validate", "--run=r", "--dataset.root=d", "--dataset.rot=d"], "Did you mean --dataset.root?"),
+    ],
+    ids=" ".join,
+)
+def test_a_mistyped_command_says_what_is_meant(arguments, expected, refused, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert expected in refused(*arguments)
+    assert not files(tmp_path)
+
+
+# --- Building --------------------------------------------------------------------------------------------------------
+
+
+def test_build_makes_the_same_files_from_the_same_seed(tmp_path, capsys) -> None:
+    for folder, seed in (("one", 3), ("two", 3), ("other", 4)):
+        cli.main(["build", "doorkey", "--episodes=20", f"--seed={seed}", f"--root={tmp_path / folder / 'data'}"])
+    said = capsys.readouterr().out.splitlines()
+    assert said == [f"20 episodes in {tmp_path / folder / 'data'}" for folder in ("one", "two", "other")]
+    one, two, other = (files(tmp_path / folder) for folder in ("one", "two", "other"))
+    assert one == two
+    assert one.keys() == other.keys()
+    changed = {name for name in one if one[name] != other[name]}
+    assert {"data/data/chunk-000/file-000.parquet", "data/meta/provenance.json"} <= changed
+
+
+def test_build_refuses_a_folder_that_is_not_empty(refused, tmp_path) -> None:
+    (tmp_path / "thesis.txt").write_text("three years of work")
+    said = refused("build", "doorkey", "--episodes=20", "--root", tmp_path)
+    assert said.startswith(f"unimask: error: {tmp_path}: folder is not empty.")
+    assert said.count("\n") == 1
+    assert files(tmp_path) == {"thesis.txt": b"three years of work"}
+
+
+def test_build_refuses_a_file(refused, tmp_path) -> None:
+    (tmp_path / "thesis.txt").write_text("three years of work")
+    said = refused("build", "doorkey", "--episodes=20", "--root", tmp_path / "thesis.txt")
+    assert said.count("\n") == 1
+    assert files(tmp_path) == {"thesis.txt": b"three years of work"}
+
+
+@pytest.mark.parametrize(
+    ("module", "function"),
+    [(dataset_builders.doorkey, "rollout"), (dataset_builders.writer, "_write_provenance")],
+    ids=["while rolling out", "while writing"],
+)
+def test_an_interrupted_build_leaves_nothing(module, function, tmp_path, monkeypatch) -> None:
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, function, interrupt)
+    with pytest.raises(SystemExit, match="interrupted"):  # a text as the status: Python prints it and ends with 1
+        cli.main(["build", "doorkey", "--episodes=20", f"--root={tmp_path / 'data'}"])
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- Validating ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def checkpoint(tiny_policy, tmp_path) -> Path:
+    tiny_policy().save_pretrained(tmp_path / "checkpoint")
+    return tmp_path / "checkpoint"
+
+
+def test_validate_prints_each_tasks_loss_and_writes_the_record(checkpoint, doorkey_root, tmp_path, capsys) -> None:
+    record = tmp_path / "results" / "validation.json"
+    cli.main(["validate", f"--run={checkpoint}", f"--dataset.root={doorkey_root}", f"--output={record}"])
+    said = capsys.readouterr().out
+    assert "forward_dynamics" in said
+    assert "random_mask" in said
+    assert '"command": "unimask validate --run=' in record.read_text()
+
+
+def test_validate_refuses_what_is_not_a_run(refused, doorkey_root, tmp_path) -> None:
+    for folder in (tmp_path, tmp_path / "nowhere", doorkey_root):
+        said = refused("validate", "--run", folder, "--dataset.root", doorkey_root)
+        assert said.startswith(f"unimask: error: {folder} is neither a checkpoint")
+        assert said.count("\n") == 1
+
+
+def test_validate_refuses_data_that_is_not_there(checkpoint, refused, tmp_path) -> None:
+    said = refused("validate", "--run", checkpoint, "--dataset.root", tmp_path / "nowhere")
+    assert str(tmp_path / "nowhere") in said
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_validate_refuses_damaged_weights(checkpoint, refused, doorkey_root) -> None:
+    (checkpoint / "model.safetensors").write_bytes(b"not weights")
+    said = refused("validate", "--run", checkpoint, "--dataset.root", doorkey_root)
+    assert "cannot be read as safetensors" in said

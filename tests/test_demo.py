@@ -1,0 +1,163 @@
+"""The demo: the whole of it as a user runs it (slow), and a small one with LeRobot's loops in this process."""
+
+import contextlib
+import io
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask.experiments import demo
+from lerobot_unimask.masks import TASKS
+
+FILES = {"demo.json", "five_panels.png", "state_distributions.png"}
+QUESTIONS = {"imitation", "imitation, sampled actions", "return 6, sampled actions"}
+SECONDS = 5 * 60
+BYTES = 4 * 10**9
+
+
+def check_files(output: Path) -> dict:
+    """What every demo leaves behind; returns its record."""
+    assert FILES <= {path.name for path in output.iterdir()}
+    for picture in ("five_panels.png", "state_distributions.png"):
+        assert (output / picture).stat().st_size > 10_000
+    assert UniMASKPolicy.from_pretrained(output / "train/checkpoints/last/pretrained_model")
+    assert list((output / "eval").rglob("*.mp4"))
+    record = json.loads((output / "demo.json").read_text())
+    assert record["rollouts"].keys() == QUESTIONS
+    assert record["loss_on_unseen_episodes"].keys() == TASKS.keys()
+    assert [panel["name"] for panel in record["panels"]] == [
+        "Imitation",
+        "Another goal",
+        "A wanted return",
+        "A waypoint",
+        "Backwards",
+    ]
+    assert record["state_distributions"]["shown"] == [0, 3, 6]
+    return record
+
+
+def numbers_in(text: str) -> list[str]:
+    return re.findall(r"-?\d+(?:\.\d+)?", text)
+
+
+def recorded(value: object) -> set[float]:
+    """Every number in a JSON value, those in its texts included, and how many entries each list has."""
+    if isinstance(value, dict):
+        return set().union(*map(recorded, [*value, *value.values()]))
+    if isinstance(value, list):
+        return set().union({float(len(value))}, *map(recorded, value))
+    if isinstance(value, str):
+        return set(map(float, numbers_in(value)))
+    return set() if value is None else {float(value)}
+
+
+def in_this_process(script: str, *arguments: str) -> None:
+    """Stands in for `demo._run`: the same main functions, without paying for LeRobot's import each time."""
+    from lerobot.scripts import lerobot_eval, lerobot_train
+
+    main = {"lerobot-train": lerobot_train.main, "lerobot-eval": lerobot_eval.main}[script]
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
+        patch.setattr(sys, "argv", [script, *arguments])
+        main()
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, str]:
+    """A demo of four updates and a few episodes: its folder, its record and what it printed itself."""
+    output = tmp_path_factory.mktemp("demo") / "unimask-demo"
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        for name, value in {"EPISODES": 40, "UNSEEN_EPISODES": 20, "ROLLOUTS": 3, "_run": in_this_process}.items():
+            patch.setattr(demo, name, value)
+        record = demo.run_demo(output, steps=4)
+    return output, record, printed.getvalue()
+
+
+def test_a_small_demo_leaves_everything(small: tuple[Path, dict, str]) -> None:
+    output, record, printed = small
+    assert check_files(output) == json.loads(json.dumps(record))
+    assert record["updates"] == 4
+    assert re.findall(r"^\[(\d)/5\] \w+", printed, re.MULTILINE) == list("12345")
+    assert f"everything is in {output}" in printed
+
+
+def test_every_number_that_is_printed_is_recorded(small: tuple[Path, dict, str]) -> None:
+    output, record, printed = small
+    results = [line.replace(str(output), "") for line in printed.splitlines() if re.match(r" {2,}\S", line)]
+    results = results[: next(number for number, line in enumerate(results) if "lerobot-eval" in line)]
+    known = recorded(record)
+    for line in results:
+        for number in numbers_in(line):
+            decimals = len(number.partition(".")[2])
+            assert any(abs(float(number) - value) <= 0.51 * 10**-decimals for value in known), line
+    assert len(results) > len(QUESTIONS) + len(TASKS) + 2 * len(record["panels"])
+
+
+def test_the_commands_to_try_next_name_what_is_there(small: tuple[Path, dict, str]) -> None:
+    output, _, printed = small
+    _, _, advice = printed.partition("What to try next:")
+    assert [word for word in ("lerobot-eval", "lerobot-train", "unimask validate") if word not in advice] == []
+    paths = re.findall(rf"{re.escape(str(output))}[\w/.-]*", advice)
+    assert len(paths) == 4
+    assert [path for path in paths if not Path(path).exists()] == []
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_place_that_is_taken_is_refused_and_left_as_it_was(tmp_path: Path, kind: str, capsys) -> None:
+    taken = tmp_path / "thesis.txt"
+    taken.write_text("three years of work")
+    with pytest.raises(FileExistsError, match="--output=DIR"):
+        demo.run_demo(tmp_path if kind == "folder" else taken)
+    assert list(tmp_path.iterdir()) == [taken]
+    assert taken.read_text() == "three years of work"
+    assert capsys.readouterr().out == ""
+
+
+def test_a_command_of_lerobots_that_fails_ends_the_demo() -> None:
+    with pytest.raises(ChildProcessError, match="lerobot-train failed"):
+        demo._run("lerobot-train", "--no_such_flag=1")
+
+
+def most_memory(process: subprocess.Popen) -> int:
+    """Bytes that a process and all below it held at once, at the most; waits until it ends.
+
+    Pages that several of them share count several times, so the true number is no higher.
+    """
+    most = 0
+    root = psutil.Process(process.pid)
+    while process.poll() is None:
+        held = 0
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for one in [root, *root.children(recursive=True)]:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    held += one.memory_info().rss
+        most = max(most, held)
+        time.sleep(0.2)
+    return most
+
+
+@pytest.mark.slow
+def test_the_full_demo_is_quick_and_small_and_answers_well(tmp_path: Path) -> None:
+    script = Path(sys.executable).with_name("unimask")
+    began = time.monotonic()
+    with (tmp_path / "log").open("w") as log:
+        process = subprocess.Popen([script, "demo"], cwd=tmp_path, stdout=log, stderr=subprocess.STDOUT)
+        most = most_memory(process)
+    seconds = time.monotonic() - began
+    assert process.returncode == 0, (tmp_path / "log").read_text()[-3000:]
+    print(f"the demo took {seconds:.0f} s and {most / 1e9:.2f} GB")
+    record = check_files(tmp_path / "unimask-demo")
+    assert seconds < SECONDS
+    assert most < BYTES
+    assert record["seconds"] <= seconds
+    assert record["rollouts"]["imitation"]["success_percent"] > 60  # at most 84; the expert itself succeeds in 7
+    achieved = {panel["name"]: panel["achieved"] for panel in record["panels"]}
+    assert achieved["Imitation"]["success"] == [True]
+    assert achieved["Another goal"]["s[-1] reached"] == [True]

@@ -1,0 +1,209 @@
+"""Validation losses: against a slow computation through `infer`, the same questions for everybody, a complete record."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+from dataset_builders.doorkey import build_doorkey
+from lerobot_unimask import TASKS, UniMASKPolicy
+from lerobot_unimask.experiments.validation import checkpoints_of, first_windows, task_losses, validate
+from lerobot_unimask.masks import RANDOM_MASK, Mask, TrainingMasks
+from lerobot_unimask.modeling_unimask import VALIDATION_STEP
+from lerobot_unimask.reads import ENVIRONMENT_VARIABLE
+
+ALL = (*TASKS, RANDOM_MASK)
+EPISODES = 30  # of the dataset in conftest
+
+
+@pytest.fixture(scope="module")
+def batch(tiny_policy, doorkey_root):
+    return first_windows(tiny_policy(), doorkey_root, "local/doorkey")
+
+
+def scaled(policy: UniMASKPolicy, scale: float) -> UniMASKPolicy:
+    """The same policy with other weights."""
+    with torch.no_grad():
+        for parameter in policy.network.parameters():
+            parameter.mul_(scale)
+    return policy
+
+
+# --- The windows -----------------------------------------------------------------------------------------------------
+
+
+def test_there_is_one_window_for_each_episode_from_its_first_step(batch, doorkey) -> None:
+    assert batch["index"].tolist() == [10 * episode for episode in range(EPISODES)]
+    assert batch["frame_index"].eq(0).all()
+    for episode, state in enumerate(batch["observation.state"]):
+        torch.testing.assert_close(state, doorkey[10 * episode]["observation.state"])
+
+
+def test_the_windows_do_not_depend_on_how_they_are_read(tiny_policy, doorkey_root, batch, monkeypatch) -> None:
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "0")
+    again = first_windows(tiny_policy(), doorkey_root, "local/doorkey")
+    assert again.keys() == batch.keys()
+    assert all(torch.equal(again[key], value) for key, value in batch.items() if isinstance(value, torch.Tensor))
+
+
+def test_a_missing_dataset_is_not_sought_on_the_hub(tiny_policy, tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"holds no LeRobotDataset"):
+        first_windows(tiny_policy(), tmp_path, "local/doorkey")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- The losses ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", ["stacked", "separate"])
+def test_a_loss_is_the_mean_surprise_at_the_asked_for_tokens(tiny_policy, batch, layout) -> None:
+    """Window by window and token by token, through `infer`, which shares neither batching nor the loss."""
+    policy = scaled(tiny_policy(token_layout=layout), 3.0)  # far from uniform
+    losses = task_losses(policy, batch, ALL)
+    truth = {"s": batch["observation.state"], "a": batch["action"].reshape(EPISODES, -1, 1)}
+    for text in ALL:
+        draw = TrainingMasks(text, tuple(policy.factors), policy.config.context_length)
+        surprises: dict[tuple[str, int], list[float]] = {}
+        for episode in range(EPISODES):
+            one = {key: value[episode : episode + 1] for key, value in batch.items() if torch.is_tensor(value)}
+            mask = draw(torch.ones(1, 10, dtype=torch.bool), one["index"], seed=0, step=VALIDATION_STEP)
+            answer = policy.infer(one, mask)
+            for name in ("s", "a"):
+                for step in mask.predict[name][0].nonzero().flatten().tolist():
+                    for d, part in enumerate(answer[name]):
+                        category = int(truth[name][episode, step, d])
+                        surprises.setdefault((name, d), []).append(-math.log(part.probabilities[0, step, category]))
+        expected = sum(sum(values) / len(values) for values in surprises.values())
+        assert losses[text] == pytest.approx(expected, rel=1e-4), text
+
+
+def test_every_policy_gets_the_same_windows_and_masks(tiny_policy, batch) -> None:
+    def asked_of(policy: UniMASKPolicy, masks) -> dict[str, list]:
+        """mask text -> all values and all visible tokens that the network was given."""
+        given = []
+        policy.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
+        task_losses(policy, batch, masks)
+        return dict(zip(masks, given, strict=True))
+
+    trained = scaled(tiny_policy(mask_seed=7, training_masks="past"), 2.0)
+    trained.updates += 1234
+    torch.manual_seed(1)
+    one = asked_of(tiny_policy(), ALL)
+    torch.manual_seed(2)
+    other = asked_of(trained, ALL[::-1])  # in another order too
+    for text in ALL:
+        (window, visible), (other_window, other_visible) = one[text], other[text]
+        for name, shown in visible.items():
+            assert torch.equal(shown, other_visible[name])
+            assert torch.equal(window.values[name], other_window.values[name])
+
+
+def test_validation_changes_neither_the_batch_nor_the_weights(tiny_policy, batch) -> None:
+    policy = tiny_policy(dropout=0.5).train()
+    weights = {name: value.clone() for name, value in policy.state_dict().items()}
+    before = {key: value.clone() for key, value in batch.items() if torch.is_tensor(value)}
+    assert task_losses(policy, batch, ALL) == task_losses(policy, batch, ALL)
+    assert all(torch.equal(batch[key], value) for key, value in before.items())
+    assert all(torch.equal(policy.state_dict()[name], value) for name, value in weights.items())
+
+
+def test_a_mask_asks_about_every_step_equally_often(tiny_policy, batch) -> None:
+    """t is uniform: over 3,000 windows, each of the ten steps of behaviour cloning is asked about 300 times."""
+    policy = tiny_policy()
+    draw = TrainingMasks("behavior_cloning", tuple(policy.factors), 10)
+    mask: Mask = draw(torch.ones(3000, 10, dtype=torch.bool), torch.arange(3000) * 10, seed=0, step=VALIDATION_STEP)
+    assert mask.predict["a"].sum(0).sub(300).abs().max() < 4 * math.sqrt(300)
+
+
+# --- Runs ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def runs(tiny_policy, tmp_path, monkeypatch) -> tuple[list[Path], Path]:
+    """Two folders as lerobot-train leaves them, three checkpoints each, and data; all paths relative."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["unimask", "build", "doorkey", "--episodes=25", "--root=data"])
+    data = Path("data")
+    build_doorkey(data, episodes=25, seed=5, progress=False)
+    folders = [Path("outputs/one"), Path("outputs/two")]
+    for seed, run in enumerate(folders):
+        for updates, scale in ((5, 4.0), (10, 0.1 + seed / 4), (15, 2.5)):  # the second is nearest to uniform
+            path = run / "checkpoints" / f"{updates:06}" / "pretrained_model"
+            policy = scaled(tiny_policy(), scale)
+            policy.updates += updates
+            policy.save_pretrained(path)
+            dataset = DatasetConfig("local/doorkey", root=str(data))
+            TrainPipelineConfig(dataset, policy=policy.config, seed=seed, steps=15)._save_pretrained(path)
+        (run / "checkpoints/last").symlink_to("000015")
+    return folders, data
+
+
+def test_of_each_run_the_checkpoint_with_the_lowest_random_mask_loss_counts(runs) -> None:
+    folders, data = runs
+    record = validate(folders, data, "local/doorkey")
+    for run, result in zip(folders, record["runs"], strict=True):
+        by_updates = {}
+        for path in checkpoints_of(run):
+            policy = UniMASKPolicy.from_pretrained(path)
+            by_updates[int(policy.updates)] = task_losses(policy, first_windows(policy, data, "local/doorkey"), ALL)
+        assert result["random_mask_loss_by_updates"] == {
+            updates: losses[RANDOM_MASK] for updates, losses in by_updates.items()
+        }
+        assert result["updates"] == 10 == min(by_updates, key=lambda updates: by_updates[updates][RANDOM_MASK])
+        assert result["losses"] == by_updates[10]
+    for task in ALL:
+        first, second = (result["losses"][task] for result in record["runs"])
+        assert record["mean"][task] == pytest.approx((first + second) / 2)
+        assert record["spread"][task] == pytest.approx(abs(first - second))
+
+
+def test_the_record_is_complete_and_names_no_place_on_this_machine(runs, tmp_path) -> None:
+    folders, data = runs
+    record = validate(folders, data, "local/doorkey")
+    text = json.dumps(record, allow_nan=False)
+    assert str(tmp_path) not in text
+    assert '"/' not in text
+    assert record.keys() == {
+        "what",
+        "validation_episodes",
+        "validation_data",
+        "mean",
+        "spread",
+        "runs",
+        "versions",
+    }
+    assert record["validation_episodes"] == 25
+    assert record["validation_data"]["seed"] == 5
+    assert record["versions"].keys() == {"python", "torch", "lerobot", "lerobot_policy_unimask"}
+    for seed, result in enumerate(record["runs"]):
+        training = result["training"]
+        assert (training["seed"], training["steps"], training["batch_size"]) == (seed, 15, 8)
+        assert training["data"] == record["validation_data"]
+        assert training["policy"]["training_masks"] == "random_mask"
+        assert {"width", "depth", "heads", "dropout", "optimizer_lr", "loss_weights"} <= training["policy"].keys()
+
+
+def test_one_checkpoint_can_be_validated_by_itself(runs) -> None:
+    folders, data = runs
+    checkpoint = folders[0] / "checkpoints/000005/pretrained_model"
+    (result,) = validate([checkpoint], data, "local/doorkey")["runs"]
+    assert result["updates"] == 5
+    assert checkpoints_of(folders[0])[0] == checkpoint
+
+
+def test_a_model_without_returns_is_validated_on_the_tasks_that_it_has(tiny_policy, doorkey, doorkey_root, tmp_path):
+    features = {key: value for key, value in doorkey.meta.features.items() if key != "observation.return_to_go"}
+    tiny_policy(features=features).save_pretrained(tmp_path)
+    (result,) = validate([tmp_path], doorkey_root, "local/doorkey")["runs"]
+    assert result["losses"].keys() == set(ALL) - {"reward_conditioned"}
+    assert result["training"] is None  # nothing but the weights and their config is there
+
+
+def test_a_folder_without_checkpoints_is_refused(tmp_path) -> None:
+    with pytest.raises(FileNotFoundError, match="neither a checkpoint"):
+        checkpoints_of(tmp_path)
