@@ -1,4 +1,4 @@
-"""`unimask build | demo | validate`: what LeRobot's own commands do not do.
+"""`unimask build | demo | validate | curve`: what LeRobot's own commands do not do.
 
 Training and evaluation are `lerobot-train` and `lerobot-eval`. Each command imports what it needs when it runs.
 """
@@ -59,6 +59,12 @@ def make_parser() -> argparse.ArgumentParser:
     )
     doorkey.set_defaults(run=_build_doorkey)
 
+    maze2d = environments.add_parser("maze2d", help="a point mass in a maze, a waypoint controller", allow_abbrev=False)
+    _dataset_arguments(maze2d, episodes=1000)
+    maze2d.add_argument("--noise", type=float, default=0.5, help="standard deviation of the noise on actions")
+    maze2d.add_argument("--maze", default="medium", help="umaze, medium, large, or a maze's own text")
+    maze2d.set_defaults(run=_build_maze2d)
+
     demo = commands.add_parser(
         "demo", help="build, train, evaluate and question a DoorKey model in a few minutes", allow_abbrev=False
     )
@@ -83,6 +89,17 @@ def make_parser() -> argparse.ArgumentParser:
     validate.add_argument("--dataset.repo_id", default="local/dataset", dest="repo_id", metavar="ME/NAME")
     validate.add_argument("--output", type=Path, help="write the record here as JSON")
     validate.set_defaults(run=_validate)
+    curve = commands.add_parser(
+        "curve", help="return of each checkpoint of a run, by LeRobot's evaluation", allow_abbrev=False
+    )
+    curve.add_argument("--run", type=Path, action="append", required=True, dest="runs", metavar="DIR")
+    curve.add_argument("--env.type", required=True, dest="env_type", choices=("doorkey", "maze2d"))
+    curve.add_argument("--episodes", type=_positive, default=200, help="rollouts of each checkpoint")
+    curve.add_argument("--last_episodes", type=_positive, default=1000, help="rollouts of the last one")
+    curve.add_argument("--batch_size", type=_positive, default=100, help="environments side by side")
+    curve.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
+    curve.add_argument("--output", type=Path, required=True, help="JSON record; a picture goes beside it")
+    curve.set_defaults(run=_curve)
     return parser
 
 
@@ -101,6 +118,20 @@ def _build_doorkey(arguments: argparse.Namespace) -> None:
         episodes=arguments.episodes,
         seed=arguments.seed,
         expert=arguments.expert,
+        repo_id=arguments.repo_id,
+    )
+    print(f"{arguments.episodes} episodes in {root}")
+
+
+def _build_maze2d(arguments: argparse.Namespace) -> None:
+    from dataset_builders.maze2d import build_maze2d
+
+    root = build_maze2d(
+        arguments.root,
+        episodes=arguments.episodes,
+        seed=arguments.seed,
+        noise=arguments.noise,
+        maze=arguments.maze,
         repo_id=arguments.repo_id,
     )
     print(f"{arguments.episodes} episodes in {root}")
@@ -128,10 +159,31 @@ def _validate(arguments: argparse.Namespace) -> None:
         print(f"written to {arguments.output}")
 
 
+def _curve(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask import plots
+    from lerobot_unimask.experiments.learning_curve import learning_curve
+
+    record = learning_curve(
+        arguments.runs,
+        arguments.env_type,
+        episodes=arguments.episodes,
+        last_episodes=arguments.last_episodes,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+    )
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    arguments.output.write_text(json.dumps(record, indent=2) + "\n")
+    picture = arguments.output.with_suffix(".png")
+    plots.learning_curves(record).savefig(picture, dpi=200)
+    print(f"written to {arguments.output} and {picture}")
+
+
 def main(argv: list[str] | None = None) -> None:
     """The console script `unimask`. Ends with status 2 and one line on bad input."""
     arguments = make_parser().parse_args(argv)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    # LeRobot logs a page where FFmpeg is missing, which only datasets with videos need.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         arguments.run(arguments)
     except KeyboardInterrupt:

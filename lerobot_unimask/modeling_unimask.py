@@ -114,7 +114,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         for name, step in tokens:
             if not table.shows_ahead[name][step]:
                 logger.warning(
-                    "%s[%d] is given, but the inference mask shows it only when it has been observed: it changes nothing.",
+                    "%s[%d] is given, but the inference mask shows it once it has been observed: it changes nothing.",
                     name,
                     step,
                 )

@@ -4,7 +4,8 @@ Colours are those of Okabe and Ito (2008), which colour-blind readers can tell a
 are 9 inches wide: saved with `figure.savefig(path, dpi=200)` they read well at 900 pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -291,4 +292,37 @@ def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
         Patch(label="neither", **HIDDEN),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=NORMAL - 1, frameon=False)
+    return figure
+
+
+# --- Experiments ------------------------------------------------------------------------------------------------------
+
+
+def learning_curves(record: Mapping[str, Any]) -> Figure:
+    """Mean return against updates, one line for each run, with bars of one standard error.
+
+    Args:
+        record: As `experiments.learning_curve` makes it.
+    """
+    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for run, colour, marker in zip(
+        record["runs"], (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK), "os^Dvx", strict=False
+    ):
+        points = run["checkpoints"]
+        axes.errorbar(
+            [point["updates"] for point in points],
+            [point["mean_return"] for point in points],
+            [point["standard_error"] for point in points],
+            color=colour,
+            marker=marker,
+            markersize=4,
+            linewidth=1.2,
+            capsize=2,
+            label=run["run"],
+        )
+    axes.set_xlabel("updates")
+    axes.set_ylabel("mean return")
+    axes.grid(color=FAINT)
+    axes.legend(fontsize=SMALL)
     return figure

@@ -1,4 +1,4 @@
-"""Validation losses: against a slow computation through `infer`, the same questions for everybody, a complete record."""
+"""Validation losses: equal to a slow computation through `infer`, the same questions for everybody, a full record."""
 
 import json
 import math

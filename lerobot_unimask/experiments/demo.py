@@ -29,6 +29,7 @@ EPISODES = 5000
 UNSEEN_EPISODES = 500
 STEPS = 3000
 ROLLOUTS = 200
+EXPERT = {"success_percent": 6.9, "mean_return": 3.04}
 
 
 def run_demo(output: Path, *, steps: int = STEPS) -> dict:
@@ -78,6 +79,7 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
         "episodes": {"training": EPISODES, "unseen": UNSEEN_EPISODES},
         "updates": steps,
         "rollouts": rollouts,
+        "expert": EXPERT,
         "loss_on_unseen_episodes": losses,
         "panels": [dataclasses.asdict(panel) for panel in panels],
         "state_distributions": _states(answer),
@@ -144,7 +146,8 @@ def _evaluate(output: Path, checkpoint: Path) -> dict[str, dict]:
     for name, result in rollouts.items():
         print(f"  {name:27} success {result['success_percent']:5.1f} %, mean return {result['mean_return']:5.2f}")
     print(
-        "  (The expert itself: success 6.9 %, mean return 3.04. Its most likely actions are far better than its own.)"
+        f"  (The expert itself: success {EXPERT['success_percent']} %, mean return {EXPERT['mean_return']}. "
+        "Its most likely actions are far better than its own.)"
     )
     return rollouts
 

@@ -59,6 +59,27 @@ def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable
     return losses
 
 
+@torch.no_grad()
+def probability_of_truth(policy: UniMASKPolicy, batch: dict[str, Tensor], text: str) -> float:
+    """The probability that the policy puts on what was recorded, its mean over the asked-for tokens of all windows.
+
+    Of one task with discrete factors; a token's components are independent, so their probabilities multiply.
+    """
+    window = policy.make_window(batch)
+    draw = TrainingMasks(text, tuple(policy.factors), policy.config.context_length).to(policy.device)
+    mask = draw(window.valid, batch["index"].to(policy.device), seed=0, step=VALIDATION_STEP)
+    answer = policy.infer(window, mask)
+    probabilities = []
+    for name, distributions in answer.distributions.items():
+        asked = mask.predict[name]
+        token = torch.ones(int(asked.sum()), device=policy.device)
+        for distribution in distributions:
+            truth = window.values[name][..., distribution.component.dims].long()
+            token = token * distribution.probabilities.gather(-1, truth).squeeze(-1)[asked]
+        probabilities.append(token)
+    return torch.cat(probabilities).mean().item()
+
+
 def checkpoints_of(run: Path) -> list[Path]:
     """A training run's checkpoints in order, or the folder itself if it is a checkpoint.
 
@@ -98,7 +119,10 @@ def validate(runs: Sequence[Path], root: Path, repo_id: str) -> dict:
             updates = int(policy.updates)
             curve[updates] = losses[RANDOM_MASK]
             if best is None or losses[RANDOM_MASK] < best["losses"][RANDOM_MASK]:
-                best = {"updates": updates, "losses": losses, "training": _training_settings(path)}
+                best = {"updates": updates, "losses": losses, "training": training_settings(path)}
+                if all(component.discrete for component in policy.factors["s"].components):
+                    truth = probability_of_truth(policy, batch, "forward_dynamics")
+                    best["forward_dynamics_probability_of_truth"] = truth
             logger.info("%s: random_mask %.4f", path, losses[RANDOM_MASK])
         results.append({**best, "random_mask_loss_by_updates": curve})
     tasks = list(results[0]["losses"])
@@ -122,7 +146,7 @@ def _provenance(root: Path) -> dict | None:
     return json.loads(path.read_text()) if path.exists() else None
 
 
-def _training_settings(checkpoint: Path) -> dict | None:
+def training_settings(checkpoint: Path) -> dict | None:
     """What lerobot-train saved beside the weights: the policy's settings, the seed, the data and its provenance."""
     path = checkpoint / "train_config.json"
     if not path.exists():

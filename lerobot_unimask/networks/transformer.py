@@ -62,7 +62,8 @@ class FactorEmbedding(nn.Module):
         if continuous:
             self.encoding = NumberEncoding(len(continuous), fine=fine_inputs)
             self.numbers = nn.Linear(self.encoding.size, width)
-        self.hidden = nn.Parameter(torch.randn(width))
+        # Small, or in a stacked token what is hidden would drown what is shown, and learning takes twice as long.
+        self.hidden = nn.Parameter(0.02 * torch.randn(width))
 
     def forward(self, value: Tensor, visible: Tensor) -> Tensor:
         """(B, K, D) and (B, K) -> (B, K, W)"""

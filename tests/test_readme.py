@@ -1,0 +1,312 @@
+"""The README cannot rot: its commands and its Python are run, in short forms, and its links and numbers have sources.
+
+The fenced blocks of README.md marked `bash` and `python` are cases in the order in which they stand, named by their
+line, and run in one folder that holds nothing but a copy of `configs/`; each may need what those before it made, so run
+this file as a whole. A command `uv run X ...` becomes the console script X beside this Python. What makes it short is
+in `SHORT`; nothing else of it is changed. What is not run is in `NOT_RUN`, with the reason; a trailing comment with the
+word hours does the same for one line.
+"""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+DOCUMENTS = [README, *sorted(ROOT.glob("docs/*.md"))]
+SECONDS = 240  # for one command, on a busy machine
+
+NOT_RUN = {
+    "git": "needs the network",
+    "cd": "the folder is this one",
+    "pip": "installs",
+    "python -m pip": "installs",
+    "python3 -m pip": "installs",
+    "uv pip": "installs",
+    "uv add": "installs",
+    "uv sync": "installs",
+    "uv run pytest": "is what runs this",
+    "uv run ruff": "is in .ci/run",
+    "uv run unimask demo": "has its own test",
+    "uv run accelerate": "wants several GPUs",
+    "uv run hf": "needs the network",
+}
+HOURS = re.compile(r"#.*\bhours\b")
+SMALL = {"policy.width": 16, "policy.depth": 1, "policy.heads": 2, "policy.feedforward_width": 16}
+# Console script -> its flags: (flag, value, when): `always`, or `smaller` where the README itself gives a larger value.
+SHORT: dict[str, list[tuple[str, int, str]]] = {
+    "unimask": [("episodes", 40, "smaller")],
+    "lerobot-train": [
+        ("steps", 4, "always"),
+        ("batch_size", 8, "always"),
+        ("save_freq", 2, "always"),
+        ("log_freq", 1, "always"),
+        ("eval_steps", 2, "smaller"),
+        ("env_eval_freq", 4, "smaller"),
+        ("num_workers", 0, "always"),  # workers have their own test, and take half a minute to start
+        ("eval.n_episodes", 2, "always"),
+        ("eval.batch_size", 2, "always"),
+    ],
+    "lerobot-eval": [("eval.n_episodes", 2, "always"), ("eval.batch_size", 2, "always")],
+}
+
+
+@dataclass
+class Block:
+    """A fenced block: its language, its text and the number of its first line."""
+
+    language: str
+    text: str
+    line: int
+
+
+@dataclass
+class Command:
+    """One line of a bash block, continuations joined."""
+
+    text: str
+    line: int
+
+    @property
+    def words(self) -> list[str]:
+        return shlex.split(self.text, comments=True)
+
+    @property
+    def reason_not_to_run(self) -> str | None:
+        if HOURS.search(self.text):
+            return "takes hours"
+        words = [word for word in self.words if not re.match(r"\w+=", word)]
+        return next((why for start, why in NOT_RUN.items() if words[: start.count(" ") + 1] == start.split()), None)
+
+
+def read_blocks(text: str) -> list[Block]:
+    blocks, inside = [], None
+    for number, line in enumerate(text.splitlines(), start=1):
+        fence = re.match(r"\s*(```+|~~~+)\s*(\w*)", line)
+        if inside is None and fence:
+            inside = Block(fence[2], "", number + 1)
+        elif inside is not None and fence:
+            blocks.append(inside)
+            inside = None
+        elif inside is not None:
+            inside.text += f"{line}\n"
+    assert inside is None, f"the block at line {inside.line} does not end"
+    return blocks
+
+
+def read_commands(block: Block) -> list[Command]:
+    commands, text, start = [], "", block.line
+    for number, line in enumerate(block.text.splitlines(), start=block.line):
+        start = start if text else number
+        text += line
+        if text.endswith("\\"):
+            text = text[:-1]
+        else:
+            commands.append(Command(text, start))
+            text = ""
+    return [command for command in commands if command.words]
+
+
+def shortened(words: list[str]) -> list[str]:
+    """A console script's command line, short."""
+    script, *arguments = words
+    flags = {name: value for name, equals, value in (word.partition("=") for word in arguments) if equals}
+    overrides: dict[str, Any] = {}
+    for name, value, when in SHORT.get(script, []):
+        given = flags.get(f"--{name}")
+        if when == "always" or (given is not None and int(given) > value):
+            overrides[name] = value
+    if script == "lerobot-train":
+        overrides |= _short_training(flags)
+    arguments = [word for word in arguments if word.split("=")[0].removeprefix("--") not in overrides]
+    arguments = [re.sub(r"/checkpoints/\d+/", "/checkpoints/last/", word) for word in arguments]
+    return [script, *arguments, *(f"--{name}={value}" for name, value in overrides.items())]
+
+
+def _short_training(flags: dict[str, str]) -> dict[str, Any]:
+    """What shortens a training run, depending on where its settings come from."""
+    config = flags.get("--config_path", "")
+    if config.endswith(".yaml"):
+        settings = yaml.safe_load((ROOT / config).read_text())
+        often = {name: 2 for name in ("eval_steps",) if settings.get(name)}
+        return SMALL | often | {name: 4 for name in ("env_eval_freq",) if settings.get(name)}
+    if flags.get("--resume") == "true":
+        return {"steps": 6}  # four have been made
+    return SMALL if "--policy.type" in flags else {}
+
+
+BLOCKS = read_blocks(README.read_text())
+CASES: list[Command | Block] = [
+    case
+    for block in BLOCKS
+    for case in (read_commands(block) if block.language == "bash" else [block] if block.language == "python" else [])
+]
+
+
+def name(case: Command | Block) -> str:
+    text = case.text if isinstance(case, Command) else "python"
+    return f"line {case.line} {' '.join(text.split())[:60]}"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the README's reader stands: after cloning, with nothing built."""
+    folder = tmp_path_factory.mktemp("readme")
+    shutil.copytree(ROOT / "configs", folder / "configs")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def namespace() -> dict[str, Any]:
+    """The Python blocks are one session."""
+    return {"__name__": "readme"}
+
+
+@pytest.mark.parametrize("case", CASES, ids=name)
+def test_what_the_readme_says_works(
+    case: Command | Block, folder: Path, namespace: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    if isinstance(case, Block):
+        padding = "\n" * (case.line - 1)  # so that a traceback names the README's lines
+        exec(compile(padding + case.text, README, "exec"), namespace)
+    elif case.reason_not_to_run:
+        pytest.skip(case.reason_not_to_run)
+    else:
+        run(case, folder)
+
+
+def run(command: Command, folder: Path) -> None:
+    """Run the short form of a command in the folder."""
+    words = command.words
+    settings = {}
+    while re.match(r"\w+=", words[0]):
+        key, _, settings[key] = words.pop(0).partition("=")
+    assert words[:2] == ["uv", "run"], f"what should the test do with {words[0]!r}? See NOT_RUN."
+    words = shortened(words[2:])
+    script = Path(sys.executable).with_name(words[0])
+    if config := next((word for word in words if re.match(r"--config_path=.*\.yaml", word)), None):
+        build_data(folder / config.partition("=")[2])
+    done = subprocess.run(
+        [script, *words[1:]],
+        cwd=folder,
+        env={**os.environ, **settings},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+    )
+    assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
+
+
+def build_data(config: Path) -> None:
+    """Make a config's dataset with the command in its opening comment, where the README has not made it."""
+    from lerobot_unimask.cli import main
+
+    text = config.read_text()
+    if not Path(yaml.safe_load(text)["dataset"]["root"]).exists():
+        build = re.search(r"^#\s+uv run (unimask build .*)$", text, re.MULTILINE)
+        assert build, f"{config.name} does not say how to build its data"
+        main(shortened(shlex.split(build[1]))[1:])
+
+
+# --- Sources ---------------------------------------------------------------------------------------------------------
+
+
+def prose(document: Path) -> str:
+    """A document without its code, in which brackets mean other things."""
+    return re.sub(r"^\s*```.*?^\s*```|`[^`\n]*`", "", document.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def heading_anchors(document: Path) -> set[str]:
+    """The names under which GitHub links a document's headings."""
+    text = re.sub(r"^\s*```.*?^\s*```", "", document.read_text(), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+\s+(.*?)\s*$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_and_images_lead_somewhere(document: Path) -> None:
+    text = prose(document)
+    targets = re.findall(r"\]\(\s*<?([^)\s>]+)", text) + re.findall(r"(?:src|href)=\"([^\"]+)\"", text)
+    targets += re.findall(r"^\[[^\]]+\]:\s*(\S+)", text, re.MULTILINE)
+    lost = []
+    for target in targets:
+        if re.match(r"[a-z]+:", target):  # another site, or mail
+            continue
+        path, _, anchor = target.partition("#")
+        file = document.parent / path if path else document
+        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in heading_anchors(file)):
+            lost.append(target)
+    assert lost == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_numbers_come_from_records(document: Path) -> None:
+    """A table under `<!-- from: PATH -->` comes from that JSON in this repository."""
+    for path in re.findall(r"<!--\s*from:\s*(\S+?)\s*-->", document.read_text()):
+        assert json.loads((ROOT / path).read_text()), path
+
+
+# --- This file -------------------------------------------------------------------------------------------------------
+
+EXAMPLE = """# Title
+
+```bash
+pip install uv   # once
+uv run unimask build doorkey --episodes=500 \\
+    --root=data/doorkey
+# a comment
+uv run lerobot-train --config_path=configs/doorkey.yaml  # about two hours
+```
+
+```python
+answer = 6 * 7
+```
+"""
+
+
+def test_blocks_and_commands_are_found_with_their_lines() -> None:
+    bash, python = read_blocks(EXAMPLE)
+    assert (bash.language, python.language, python.line, python.text) == ("bash", "python", 12, "answer = 6 * 7\n")
+    install, build, train = read_commands(bash)
+    assert [command.line for command in (install, build, train)] == [4, 5, 8]
+    assert build.words == ["uv", "run", "unimask", "build", "doorkey", "--episodes=500", "--root=data/doorkey"]
+    assert install.reason_not_to_run == "installs"
+    assert build.reason_not_to_run is None
+    assert train.reason_not_to_run == "takes hours"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("unimask build doorkey --episodes=500 --root=d", "unimask build doorkey --root=d --episodes=40"),
+        ("unimask build doorkey --root=d", "unimask build doorkey --root=d"),
+        (
+            "lerobot-eval --policy.path=o/checkpoints/004000/pretrained_model --eval.n_episodes=100",
+            "lerobot-eval --policy.path=o/checkpoints/last/pretrained_model --eval.n_episodes=2 --eval.batch_size=2",
+        ),
+    ],
+)
+def test_only_what_makes_it_long_is_changed(line: str, expected: str) -> None:
+    assert " ".join(shortened(line.split())) == expected
+
+
+def test_training_is_shortened_by_what_it_starts_from() -> None:
+    fresh = shortened(["lerobot-train", "--policy.type=unimask", "--steps=4000", "--eval_steps=500"])
+    assert {"--steps=4", "--policy.width=16", "--eval_steps=2", "--num_workers=0"} <= set(fresh)
+    assert not {"--steps=4000", "--eval_steps=500"} & set(fresh)
+    tuned = shortened(["lerobot-train", "--policy.path=o/checkpoints/last/pretrained_model"])
+    assert not [word for word in tuned if "width" in word]
+    resumed = shortened(["lerobot-train", "--config_path=o/train_config.json", "--resume=true"])
+    assert "--steps=6" in resumed
