@@ -33,8 +33,8 @@ def refused(capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--help"], ["build", "demo", "validate", "lerobot-train", "lerobot-eval"]),
-        (["build", "--help"], ["doorkey"]),
+        (["--help"], ["build", "demo", "validate", "curve", "lerobot-train", "lerobot-eval"]),
+        (["build", "--help"], ["doorkey", "maze2d"]),
         (["build", "doorkey", "--help"], ["--episodes", "--seed", "--root", "--repo_id", "--expert", "default: 500"]),
         (["demo", "--help"], ["--output", "--steps"]),
         (["validate", "--help"], ["--run", "--dataset.root", "--output"]),

@@ -16,7 +16,7 @@ from lerobot_unimask.envs.doorkey import DOOR, GOAL, HORIZON, DoorKeyEnv, cell_a
 from lerobot_unimask.inference import Answer, Given
 from lerobot_unimask.masks import parse_token
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.window import RETURN_SO_FAR, STATE, Window
+from lerobot_unimask.window import RETURN_SO_FAR, STATE
 
 
 def state_at(agent: tuple[int, int], key: tuple[int, int]) -> list[int]:
@@ -114,12 +114,7 @@ def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, samples: int =
         samples: How many to choose them from, at least as many.
         seed: Of the samples.
     """
-    K = policy.config.context_length
-    empty = Window(
-        {name: torch.zeros(samples, K, factor.size) for name, factor in policy.factors.items()},
-        torch.ones(samples, K, dtype=torch.bool),
-    )
-    drawn = policy.sample(empty, BACKWARDS_QUESTION, given=BACKWARDS_GIVEN, order="backward", seed=seed)
+    drawn = policy.sample(None, BACKWARDS_QUESTION, given=BACKWARDS_GIVEN, samples=samples, order="backward", seed=seed)
     states = drawn.values["s"].long().cpu().numpy()  # (samples, K, 2)
     actions = drawn.values["a"][:, :-1, 0].long().cpu().numpy()  # (samples, K - 1)
     impossible = (~possible_steps(states, actions)).sum(axis=1)  # (samples,)
@@ -170,7 +165,7 @@ def roll_out(
         question: A mask that asks for a[t].
         given: Values of single tokens, shared or one per episode.
         sample: Draw the actions instead of taking the most likely ones.
-        seed: Of those draws; the global generator is left as it was.
+        seed: Of those draws.
 
     Returns:
         What the expert's rollouts are made of too; the states include the one after the last action.
@@ -183,18 +178,18 @@ def roll_out(
         env.reset(options={"agent": agent, "key": key})[0] for env, (agent, key) in zip(envs, starts, strict=True)
     ]
     states, doors, actions, rewards = [_states(observations)], [_doors(envs)], [], []
-    cuda = [policy.device] if policy.device.type == "cuda" else []
+    generator = torch.Generator(policy.device).manual_seed(seed)
     policy.reset()
-    with torch.random.fork_rng(devices=cuda):
-        torch.manual_seed(seed)
-        for _ in range(HORIZON):
-            chosen = policy.select_action(_batch(observations), mask=question, given=given, sample=sample)  # (N, 1)
-            played = [env.step(action) for env, action in zip(envs, chosen.cpu().numpy(), strict=True)]
-            observations = [observation for observation, *_ in played]
-            states.append(_states(observations))
-            doors.append(_doors(envs))
-            actions.append(chosen[:, 0].cpu().numpy())
-            rewards.append(np.array([reward for _, reward, *_ in played], dtype=np.int64))
+    for _ in range(HORIZON):
+        chosen = policy.select_action(
+            _batch(observations), mask=question, given=given, sample=sample, generator=generator
+        )  # (N, 1)
+        played = [env.step(action) for env, action in zip(envs, chosen.cpu().numpy(), strict=True)]
+        observations = [observation for observation, *_ in played]
+        states.append(_states(observations))
+        doors.append(_doors(envs))
+        actions.append(chosen[:, 0].cpu().numpy())
+        rewards.append(np.array([reward for _, reward, *_ in played], dtype=np.int64))
     policy.reset()
     agent, key = np.moveaxis(np.stack(states, axis=1), -1, 0)  # (N, K + 1) each
     return Episodes(agent, key, np.stack(doors, axis=1), np.stack(actions, axis=1), np.stack(rewards, axis=1))
