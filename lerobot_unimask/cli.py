@@ -7,6 +7,7 @@ import argparse
 import difflib
 import json
 import logging
+import shlex
 import sys
 from pathlib import Path
 
@@ -147,9 +148,7 @@ def _validate(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.experiments.validation import validate
 
     record = validate(arguments.runs, arguments.root, arguments.repo_id)
-    record["command"] = "unimask validate " + " ".join(
-        [f"--run={run}" for run in arguments.runs] + [f"--dataset.root={arguments.root}"]
-    )
+    record["command"] = arguments.text
     width = max(map(len, record["mean"]))
     for task, loss in record["mean"].items():
         print(f"{task:{width}}  {loss:.4f}  (spread {record['spread'][task]:.4f} over {len(arguments.runs)} runs)")
@@ -171,6 +170,7 @@ def _curve(arguments: argparse.Namespace) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
     )
+    record["command"] = arguments.text
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(json.dumps(record, indent=2) + "\n")
     picture = arguments.output.with_suffix(".png")
@@ -180,7 +180,9 @@ def _curve(arguments: argparse.Namespace) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     """The console script `unimask`. Ends with status 2 and one line on bad input."""
+    argv = sys.argv[1:] if argv is None else argv
     arguments = make_parser().parse_args(argv)
+    arguments.text = shlex.join(["unimask", *argv])  # for records
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     # LeRobot logs a page where FFmpeg is missing, which only datasets with videos need.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -121,8 +121,8 @@ def test_a_place_that_is_taken_is_refused_and_left_as_it_was(tmp_path: Path, kin
 
 
 def test_a_command_that_fails_ends_the_demo() -> None:
-    with pytest.raises(ChildProcessError, match="python failed, with status 3"):
-        demo._run("python", "-c", "raise SystemExit(3)")
+    with pytest.raises(ChildProcessError, match="no-such-command failed, with status 1"):
+        demo._run("no-such-command")
 
 
 def most_memory(process: subprocess.Popen) -> int:

@@ -29,6 +29,13 @@ EPISODES = 5000
 UNSEEN_EPISODES = 500
 STEPS = 3000
 ROLLOUTS = 200
+# What the console script does, without the page that LeRobot logs where FFmpeg, which only videos need, is missing.
+CONSOLE_SCRIPT = """
+import logging
+logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+from lerobot.scripts.{module} import main
+main()
+"""
 EXPERT = {"success_percent": 6.9, "mean_return": 3.04}
 
 
@@ -153,10 +160,11 @@ def _evaluate(output: Path, checkpoint: Path) -> dict[str, dict]:
 
 
 def _run(script: str, *arguments: str) -> None:
-    """One of LeRobot's console scripts of this environment, with its own output."""
+    """One of LeRobot's console scripts, with its own output."""
     print(f"$ {shlex.join([script, *arguments])}", flush=True)
     environment = {**os.environ, "HF_HUB_OFFLINE": "1"}  # everything is local
-    done = subprocess.run([Path(sys.executable).with_name(script), *arguments], env=environment)
+    command = [sys.executable, "-c", CONSOLE_SCRIPT.format(module=script.replace("-", "_")), *arguments]
+    done = subprocess.run(command, env=environment)
     if done.returncode != 0:
         raise ChildProcessError(f"{script} failed, with status {done.returncode}; what it printed says why.")
 
@@ -173,9 +181,9 @@ def _close(output: Path, checkpoint: Path, seconds: float) -> None:
     print(f"""
 Done in {seconds:.0f} s; everything is in {output}. Look at {output}/five_panels.png first. What to try next:
 
-  lerobot-eval --policy.path={checkpoint} --env.type=doorkey --eval.n_episodes=100 --eval.batch_size=50 \\
+  uv run lerobot-eval --policy.path={checkpoint} --env.type=doorkey --eval.n_episodes=100 --eval.batch_size=50 \\
       --policy.inference_mask='a[t] | s[:t+1], a[:t], s[-1]' --policy.given='{{"s[-1]": [12, 12]}}'
-  lerobot-train --policy.path={checkpoint} --policy.push_to_hub=false --policy.training_masks=behavior_cloning \\
+  uv run lerobot-train --policy.path={checkpoint} --policy.push_to_hub=false --policy.training_masks=behavior_cloning \\
       --dataset.repo_id=local/doorkey --dataset.root={output}/data --steps=500 --num_workers=0
-  unimask validate --run={output}/train --dataset.root={output}/data_unseen
+  uv run unimask validate --run={output}/train --dataset.root={output}/data_unseen
 """)

@@ -100,21 +100,31 @@ def checkpoints_of(run: Path) -> list[Path]:
 def validate(runs: Sequence[Path], root: Path, repo_id: str) -> dict:
     """Validate every checkpoint of each run; of each run, keep the one with the lowest random-mask loss.
 
+    Raises:
+        FileNotFoundError: a folder that is neither a checkpoint nor a training run.
+        ValueError: the runs have different windows or features.
+
     Returns:
         A JSON record: for each run the chosen checkpoint's losses and training settings, and over the runs each task's
         mean and spread.
     """
     results = []
-    batch = None
+    model = None
     for run in runs:
         best = None
         curve = {}
         for path in checkpoints_of(run):
             policy = UniMASKPolicy.from_pretrained(path)
-            batch = batch or first_windows(policy, root, repo_id)
-            masks = [
-                text for text in (*TASKS, RANDOM_MASK) if "rtg" not in TASKS.get(text, "") or "rtg" in policy.factors
-            ]
+            if model is None:  # one question, and the same windows, for all
+                model = policy.config.context_length, policy.config.features
+                batch = first_windows(policy, root, repo_id)
+                masks = [
+                    text
+                    for text in (*TASKS, RANDOM_MASK)
+                    if "rtg" not in TASKS.get(text, "") or "rtg" in policy.factors
+                ]
+            elif model != (policy.config.context_length, policy.config.features):
+                raise ValueError(f"{path} has another context length or other features than {runs[0]}: not comparable.")
             losses = task_losses(policy, batch, masks)
             updates = int(policy.updates)
             curve[updates] = losses[RANDOM_MASK]
