@@ -75,8 +75,6 @@ class UniMASKConfig(PreTrainedConfig):
     # Read off the training dataset and saved, so that a checkpoint knows what it was trained on.
     features: dict[str, list[Feature]] = field(default_factory=dict)
     # Factor name -> the dataset's columns that make it up.
-    remembered_episodes: int = 0
-    # How many training episodes' first states and returns the checkpoint holds, for target_return=auto.
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)

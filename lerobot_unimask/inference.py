@@ -168,6 +168,8 @@ def read_given(
     tokens = {}
     for text, value in given.items():
         name, step = parse_token(text, tuple(factors), context_length)
+        if (name, step) in tokens:
+            raise ValueError(f"{name}[{step}] is given twice, the second time as {text}.")
         tokens[name, step] = _token(text, value, factors[name], batch_size)
     return tokens
 
@@ -202,9 +204,9 @@ def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
     elif token.ndim == 1:
         token = token.unsqueeze(0)
     if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B or token.shape[0]):
-        rows = "one such row for each" if B is None else f"one such row for each of the {B}"
+        each = "each window or environment" if B is None else f"each of the {B} windows or environments"
         raise ValueError(
-            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or {rows} windows or environments."
+            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or one such row for {each}."
         )
     check_values(f"{text} is given {value!r}, which", token, factor)
     return token
@@ -273,6 +275,7 @@ class RolloutMemory:
     slides.
     """
 
+    @torch.inference_mode(False)
     def __init__(self, factors: Mapping[str, Factor], context_length: int, batch_size: int, device: torch.device):
         K = context_length
         self.step = -1  # of the episode; nothing has been observed yet
@@ -292,6 +295,7 @@ class RolloutMemory:
         """The episode's step at position 0."""
         return self.step - self.position
 
+    @torch.inference_mode(False)  # LeRobot acts in inference mode; what is remembered outlives it
     def observe(self, state: Tensor, return_so_far: Tensor | None) -> None:
         """Begin a step: (B, D) of `s`, and (B,) the rewards received so far, where the environment reports them.
 
@@ -305,12 +309,13 @@ class RolloutMemory:
                     self.values[name] = self.values[name].roll(-1, dims=1)
                 self.return_so_far = self.return_so_far.roll(-1, dims=1)
             self.acted = False
-        self.values["s"][:, self.position] = state
+        self.values["s"][:, self.position] = state.clone()
         self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
 
+    @torch.inference_mode(False)
     def act(self, action: Tensor) -> None:
         """End the step: (B, D) of `a`."""
-        self.values["a"][:, self.position] = action
+        self.values["a"][:, self.position] = action.clone()
         self.acted = True
 
     def known(self) -> dict[str, Tensor]:

@@ -84,8 +84,12 @@ class Question:
     shown: tuple[Term, ...]
 
     @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.asked + self.shown
+
+    @property
     def uses_t(self) -> bool:
-        steps = [step for term in self.asked + self.shown for step in term.steps]
+        steps = [step for term in self.terms for step in term.steps]
         bounds = [b for s in steps for b in ((s.start, s.stop) if isinstance(s, Slice) else (s,)) if b is not None]
         return any(bound.relative for bound in bounds)
 
@@ -278,9 +282,11 @@ class MaskTable:
             MaskError: the question has a t and none is given, or it does not admit this one.
         """
         if not self.question.uses_t:
+            if t is not None:
+                raise MaskError(f"t={t} is given, but the question is about no step t.", self.question.text, 0)
             row = 0
         elif t is None:
-            raise MaskError("The question is about a step t: say which, as in t=3.", self.question.text)
+            raise MaskError("The question is about a step t: say which, as in t=3.", self.question.text, 0)
         elif int(t) not in self.t.tolist():
             admitted = ", ".join(map(str, self.t.tolist()))
             raise MaskError(
@@ -309,7 +315,7 @@ def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTa
     """
     question = parse(text)
     text = question.text
-    _check_factors(question.asked + question.shown, factors, text)
+    _check_factors(question.terms, factors, text)
     for term in question.asked:
         if term.factor not in ASKABLE:
             raise MaskError(f"{term.factor} can be shown but never asked; ask for s or a.", text, term.position)
@@ -426,7 +432,8 @@ class TrainingMasks(nn.Module):
 
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
-            of a task, `random_mask`, or a regime's name (`multi_task`: the eight tasks, sharing its weight).
+            of a task, `random_mask`, or a regime's name (`multi_task`: the eight tasks, sharing its weight; without a
+            return factor, seven).
         factors: the model's factors.
         context_length: K.
 
@@ -438,7 +445,7 @@ class TrainingMasks(nn.Module):
     def __init__(self, masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[str], context_length: int):
         super().__init__()
         self.factors = tuple(factors)
-        self.weights = mixture(masks)
+        self.weights = mixture(masks, self.factors)
         tables = [tabulate(text, self.factors, context_length) for text in self.weights if text != RANDOM_MASK]
         tasks = [task for task, text in enumerate(self.weights) if text != RANDOM_MASK]
         self.random_task = list(self.weights).index(RANDOM_MASK) if RANDOM_MASK in self.weights else None
@@ -500,8 +507,11 @@ class TrainingMasks(nn.Module):
         return hidden
 
 
-def mixture(masks: str | Sequence[str] | Mapping[str, float]) -> dict[str, float]:
+def mixture(masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[str] | None = None) -> dict[str, float]:
     """`training_masks` as one mapping from texts to weights, regimes expanded.
+
+    Args:
+        factors: the model's; a regime is then made of the tasks that it has the factors for. None: not known yet.
 
     Raises:
         ValueError: nothing given, or weights that are not positive numbers.
@@ -516,6 +526,8 @@ def mixture(masks: str | Sequence[str] | Mapping[str, float]) -> dict[str, float
         if not isinstance(weight, int | float) or not 0 < weight < float("inf"):
             raise ValueError(f"training_masks gives {text!r} the weight {weight!r}; weights are positive numbers.")
         members = REGIMES.get(text, (text,))
+        if text in REGIMES and factors is not None:
+            members = [member for member in members if {term.factor for term in parse(member).terms} <= set(factors)]
         for member in members:
             expanded[member] = expanded.get(member, 0.0) + weight / len(members)
     return expanded

@@ -1,6 +1,7 @@
 """UniMASKPolicy: the masked model behind LeRobot's policy contract, and the questions that one can ask it."""
 
 import logging
+import operator
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,7 +63,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         self.factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
         self._check_settings()
         self.statistics = Statistics(config.features, self.factors, config.context_length)
-        self.episode_starts = EpisodeStarts(config.remembered_episodes, self.factors["s"].size)
+        self.episode_starts = EpisodeStarts(self.factors["s"].size)
         self._read_dataset(dataset_stats, dataset_meta)
         self.training_masks = TrainingMasks(config.training_masks, tuple(self.factors), config.context_length)
         self.network = Transformer(
@@ -90,7 +91,6 @@ class UniMASKPolicy(PreTrainedPolicy):
             starts = read_starts(Path(meta.root), [f.key for f in self.config.features["s"]], RETURN_TO_GO)
             if starts is not None:
                 self.episode_starts.fill(*starts)
-                self.config.remembered_episodes = len(starts[0])
 
     def _check_settings(self) -> None:
         unknown = set(self.config.loss_weights) - {"s", "a"}
@@ -111,6 +111,19 @@ class UniMASKPolicy(PreTrainedPolicy):
                 raise ValueError("target_return and given both name rtg[0]; give one of them.")
             tokens.append(("rtg", 0))
         inference.check_shown(tokens, table.shows, self.config.inference_mask)
+        missing = [
+            f"{name}[{step}]"
+            for name, ahead in table.shows_ahead.items()
+            for step in ahead.nonzero().flatten().tolist()
+            if (name, step) not in tokens
+        ]
+        if missing:
+            logger.warning(
+                "The inference mask shows %s before a rollout has observed it: a rollout fails unless it is given, with "
+                "%s or in each call of select_action.",
+                ", ".join(missing),
+                "target_return" if missing == ["rtg[0]"] else "given",
+            )
         for name, step in tokens:
             if not table.shows_ahead[name][step]:
                 logger.warning(
@@ -150,14 +163,15 @@ class UniMASKPolicy(PreTrainedPolicy):
 
     # --- Asking ------------------------------------------------------------------------------------------------------
 
-    def make_window(self, batch: Mapping[str, Tensor]) -> Window:
-        """A LeRobot batch as a window of this model, in the dataset's units (`window.make_window` gives the shapes)."""
+    def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
+        """A LeRobot batch as a window of this model, in the dataset's units; see `window.make_window`."""
         window = make_window(
             {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)},
             self.config.features,
             self.config.context_length,
             horizon=self.statistics.horizon,
             fps=self.statistics.fps,
+            partial=partial,
         )
         return window
 
@@ -173,8 +187,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         """The distribution of every asked-for token given the shown ones.
 
         Args:
-            window: recorded values: a LeRobot batch ((B, K, ...) under the dataset's keys) or a Window; None where
-                everything shown is in `given`. Not changed.
+            window: recorded values: a LeRobot batch ((B, K, ...) under the dataset's keys; columns that the mask does
+                not show may be missing) or a Window; None where everything shown is in `given`. Not changed.
             mask: a question, the name of a task, or a Mask.
             t: the step that the question is about, where it has a t.
             given: values of single tokens, {"s[-1]": [15, 15], "rtg[0]": 5}, instead of the recorded ones. Steps past
@@ -229,23 +243,27 @@ class UniMASKPolicy(PreTrainedPolicy):
             empty = RolloutMemory(self.factors, K, max(rows, default=1), self.device)
             window = empty.window(self.statistics.horizon)
         elif not isinstance(window, Window):
-            window = self.make_window(window)
+            window = self.make_window(window, partial=True)
         if window.valid.shape[1] != K:
             raise ValueError(f"The window has {window.valid.shape[1]} steps; this model's have {K}.")
         window = window.to(self.device)
         batch_size = len(window.valid)
-        tokens = inference.read_given(given or {}, self.factors, K, batch_size)
-        known = {name: torch.full((K,), recorded) for name in self.factors}
-        for name, step in tokens:  # here the user changes a recorded window on purpose
-            known[name][step] = False
-        window, known = inference.give(window, tokens, known)
         if isinstance(mask, Mask):
             text = mask.draw()
         else:
-            text, mask = mask, self._table(mask).at(t, batch_size)
+            table = self._table(mask)
+            text, mask = table.question.text, table.at(None if t is None else operator.index(t), batch_size)
+        mask = mask.to(self.device).within(window.valid)
+        tokens = inference.read_given(given or {}, self.factors, K, batch_size)
+        known = {}
+        for name, value in window.values.items():
+            lacking = mask.visible[name] & value.isnan().any(-1)  # as in a sample, or a column that is not there
+            known[name] = torch.full((K,), recorded) & ~lacking.any(0).cpu()
+        for name, step in tokens:  # here the user changes a recorded window on purpose
+            known[name][step] = False
+        window, known = inference.give(window, tokens, known)
         inference.check_shown(tokens, mask.visible, text)
         inference.check_known(mask, known, text)
-        mask = mask.to(self.device).within(window.valid)
         for name, value in window.values.items():
             inference.check_values(f"A shown token of {name}", value[mask.visible[name]], self.factors[name])
         return window, mask
@@ -263,7 +281,11 @@ class UniMASKPolicy(PreTrainedPolicy):
         K = self.config.context_length
         steps = table.t.tolist()
         if steps != list(range(K)) or not all(table.predict[t, table.factors.index("a"), t] for t in steps):
-            raise MaskError("A mask for a rollout asks for a[t] at every step, as 'a[t] | s[:t+1], a[:t]' does.", text)
+            raise MaskError(
+                "A mask for a rollout asks for a[t] at every step, as 'a[t] | s[:t+1], a[:t]' does.",
+                table.question.text,
+                table.question.asked[0].position,
+            )
         return table
 
     # --- Acting ------------------------------------------------------------------------------------------------------
@@ -303,8 +325,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         memory = self._memory
         if memory is None or len(memory.valid) != len(state):
             memory = self._memory = RolloutMemory(self.factors, self.config.context_length, len(state), self.device)
-        text = self.config.inference_mask if mask is None else mask
-        table = self._acting_table(text)
+        table = self._acting_table(self.config.inference_mask if mask is None else mask)
+        text = table.question.text
         so_far = batch.get(RETURN_SO_FAR)
         memory.observe(state, so_far.to(self.device).reshape(-1) if so_far is not None else None)
         if memory.step == 0:
@@ -331,7 +353,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         return action.long() if discrete else action
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """A chunk of one action, (B, 1, D): the question is asked anew at every step."""
+        """A chunk of one action, (B, 1, D): `select_action`, which counts as the step's action; the question is asked
+        anew at every step."""
         return self.select_action(batch, **kwargs).unsqueeze(1)
 
     def _choose_target(self, state: Tensor) -> Tensor | None:
@@ -350,6 +373,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         parts = []
         for feature in self.config.features["s"]:
             value = batch.get(feature.key)
+            if value is not None and value.ndim == 1 and feature.size == 1:
+                value = value.unsqueeze(-1)
             if value is None or value.shape[-1] != feature.size or value.ndim != 2:
                 found = "nothing" if value is None else f"shape {tuple(value.shape)}"
                 raise ValueError(
@@ -398,6 +423,8 @@ class UniMASKPolicy(PreTrainedPolicy):
             weights = load_file(model_file, device="cpu")
         except (SafetensorError, OSError) as error:
             raise ValueError(f"{model_file} cannot be read as safetensors: {error}") from error
+        if weights.get("episode_starts.returns", torch.empty(())).ndim == 1:
+            model.episode_starts.make_room(len(weights["episode_starts.returns"]))
         expected = model.state_dict()
         faults = [f"missing {name}" for name in expected if name not in weights]
         faults += [f"extra {name}" for name in weights if name not in expected]

@@ -45,13 +45,17 @@ class EpisodeStarts(nn.Module):
     `states` is (E, D), `returns` (E,), both in the dataset's units.
     """
 
-    def __init__(self, episodes: int, size: int):
+    def __init__(self, size: int):
         super().__init__()
-        self.register_buffer("states", torch.zeros(episodes, size))
-        self.register_buffer("returns", torch.zeros(episodes))
+        self.register_buffer("states", torch.zeros(0, size))
+        self.register_buffer("returns", torch.zeros(0))
 
     def fill(self, states: Tensor, returns: Tensor) -> None:
         self.states, self.returns = states.to(self.states), returns.to(self.returns)
+
+    def make_room(self, episodes: int) -> None:
+        """For a checkpoint's episodes, whose number the weights alone tell."""
+        self.fill(self.states.new_zeros(episodes, self.states.shape[1]), self.returns.new_zeros(episodes))
 
     def nearest_return(self, state: Tensor) -> Tensor:
         """The return of the training episode whose first state is nearest, (B, D) -> (B, 1) (paper, appendix
@@ -69,7 +73,10 @@ class EpisodeStarts(nn.Module):
 
 
 def read_starts(root: Path, state_keys: Sequence[str], return_key: str) -> tuple[Tensor, Tensor] | None:
-    """First states (E, D) and returns (E,) of a LeRobotDataset's episodes; None if its data is not there."""
+    """First states (E, D) and returns (E,) of a LeRobotDataset's episodes; None if its data is not there.
+
+    Note: All its episodes, those too that `--dataset.eval_split` holds out: a policy is not told which these are.
+    """
     if not (root / "data").is_dir():
         return None
     data = pyarrow.dataset.dataset(root / "data", format="parquet")

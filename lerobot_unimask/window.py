@@ -124,6 +124,7 @@ def make_window(
     *,
     horizon: Tensor,
     fps: Tensor,
+    partial: bool = False,
 ) -> Window:
     """Read a window from a LeRobot batch, which is not changed.
 
@@ -131,14 +132,22 @@ def make_window(
         batch: the dataset's keys, each (B, K, size) or, for features of one number, (B, K) or (B, K, 1);
             `observation.state_is_pad` (B, K) if steps lie past the episode's end; `timestamp` (B,), seconds of step 0.
         horizon: steps of an episode. With `fps` it turns the timestamp into the return token's timestep / horizon.
+        partial: columns may be missing, all but one; their values are NaN then.
 
     Raises:
         KeyError: a column that the model needs is missing.
         ValueError: a column's shape is not (B, context_length, size).
     """
     values = {}
+    present = [feature.key for columns in features.values() for feature in columns if feature.key in batch]
     for name, columns in features.items():
-        parts = [_column(batch, feature, context_length) for feature in columns]
+        if partial and present:
+            like = batch[present[0]]
+            nothing = like.new_full((len(like), context_length), torch.nan, dtype=torch.float32)
+            filled = {f.key: nothing.unsqueeze(-1).expand(-1, -1, f.size) for f in columns if f.key not in batch}
+            parts = [_column({**batch, **filled}, feature, context_length) for feature in columns]
+        else:
+            parts = [_column(batch, feature, context_length) for feature in columns]
         if name == "rtg":
             parts.append(_timestep(batch, parts[0], fps) / horizon)
         values[name] = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
@@ -193,7 +202,8 @@ class Statistics(nn.Module):
         """Take over a dataset's statistics, as `LeRobotDatasetMetadata.stats` holds them.
 
         Raises:
-            ValueError: a continuous feature has no mean and standard deviation there.
+            ValueError: a continuous feature has no mean and standard deviation there, or a discrete one more values
+                than categories.
         """
         for name, columns in self.features.items():
             mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
@@ -201,14 +211,17 @@ class Statistics(nn.Module):
             for feature in columns:
                 dims = slice(start, start + feature.size)
                 start += feature.size
+                known = {key: _numbers(value).to(mean) for key, value in dataset_stats.get(feature.key, {}).items()}
                 if feature.categories is None:
-                    if feature.key not in dataset_stats:
+                    if not {"mean", "std"} <= known.keys():
                         raise ValueError(f"The dataset's statistics lack {feature.key!r}: recompute them with LeRobot.")
-                    mean[dims] = _numbers(dataset_stats[feature.key]["mean"])
-                    deviation = _numbers(dataset_stats[feature.key]["std"])
-                    std[dims] = torch.where(
-                        deviation > 1e-6 * (1 + mean[dims].abs()), deviation, 1.0
-                    )  # constants are only shifted
+                    constant = known["std"] <= 1e-6 * (1 + known["mean"].abs())  # is only shifted
+                    mean[dims], std[dims] = known["mean"], torch.where(constant, 1.0, known["std"])
+                elif "max" in known and (known["max"] >= torch.tensor(feature.categories).to(mean)).any():
+                    raise ValueError(
+                        f"{feature.key} reaches {known['max'].tolist()} in the dataset, whose info.json gives it the "
+                        f"categories {feature.categories}: numbers from 0 to one less."
+                    )
         if "frame_index" in dataset_stats and "timestamp" in dataset_stats:
             last = _numbers(dataset_stats["frame_index"]["max"])
             self.horizon.fill_(last.item() + 1)

@@ -76,7 +76,7 @@ def test_lerobot_eval_with_other_questions(trained: tuple[Path, str], tmp_path: 
         "--output_dir=eval",
         cwd=tmp_path,
     )
-    assert "async" not in log.lower().split("error")[-1] or "Traceback" not in log
+    assert "async=True" in log  # LeRobot's default, which the environments answer with synchronous stepping
     info = json.loads((tmp_path / "eval/eval_info.json").read_text())
     assert info["overall"]["n_episodes"] == 4
     assert {"pc_success", "avg_sum_reward"} <= info["overall"].keys()

@@ -46,7 +46,9 @@ def test_lerobot_discovers_the_wheel_and_makes_policy_and_environment_by_name(in
 import sys
 from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
+import importlib.metadata
 import lerobot_unimask
+print(importlib.metadata.distribution("lerobot_policy_unimask").locate_file(""))
 from lerobot.envs import make_env
 from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import get_policy_class, make_policy_config
@@ -59,7 +61,8 @@ print(build_doorkey("doorkey", episodes=2, progress=False).name)
 print(lerobot_unimask.__file__)
 print([path for path in sys.path if path and "site" not in path and "python" not in path])
 """
-    environments, name, file, others = run_outside(code, installed, tmp_path).splitlines()[-4:]
+    distribution, environments, name, file, others = run_outside(code, installed, tmp_path).splitlines()[-5:]
+    assert Path(distribution) == installed
     assert (environments, name) == ("2", "doorkey")
     assert Path(file).is_relative_to(installed)
     assert str(ROOT) not in others

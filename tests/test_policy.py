@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_unimask import TASKS, MaskError, UniMASKConfig, UniMASKPolicy, Window
 from lerobot_unimask.inference import ORDERS
-from lerobot_unimask.masks import TrainingMasks
+from lerobot_unimask.masks import TrainingMasks, mixture
 
 KINDS = ("doorkey", "continuous", "gaussian")
 LAYOUTS = ("stacked", "separate")
@@ -979,3 +979,87 @@ def test_a_checkpoint_keeps_how_its_training_episodes_began(tmp_path, doorkey_ro
     torch.testing.assert_close(
         loaded.episode_starts.returns, torch.stack([f["observation.return_to_go"] for f in firsts]).flatten()
     )
+
+
+# --- What an independent reviewer broke ------------------------------------------------------------------------------
+
+
+def test_acting_goes_on_outside_inference_mode(tiny_policy):
+    policy, state = tiny_policy(context_length=2), {"observation.state": torch.tensor([[5.0, 0.0]])}
+    with torch.inference_mode():
+        policy.select_action(state)
+        policy.select_action(state)
+    assert policy.select_action(state).shape == (1, 1)
+    with torch.inference_mode():
+        assert policy.select_action(state).shape == (1, 1)
+
+
+def test_a_question_needs_no_columns_that_it_does_not_show(tiny_policy, doorkey_batch):
+    policy = tiny_policy()
+    keys = ("observation.state", "action")
+    part = {key: doorkey_batch[key] for key in (*keys, *(f"{key}_is_pad" for key in keys))}
+    whole = policy.infer(doorkey_batch, "forward_dynamics", t=0)
+    torch.testing.assert_close(
+        policy.infer(part, "forward_dynamics", t=0)["s"][0].probabilities, whole["s"][0].probabilities, equal_nan=True
+    )
+    with pytest.raises(ValueError, match=r"shows rtg\[0\]"):
+        policy.infer(part, "reward_conditioned", t=0)
+    with pytest.raises(KeyError, match="return_to_go"):
+        policy.forward(part)
+
+
+def test_a_sample_can_be_asked_about_where_it_was_drawn_and_nowhere_else(tiny_policy):
+    policy = tiny_policy()
+    drawn = policy.sample(None, "s[1] | s[0]", given={"s[0]": [5, 0]})
+    assert policy.infer(drawn, "s[2] | s[0], s[1]")["s"][0].probabilities[0, 2].sum() == pytest.approx(1)
+    with pytest.raises(ValueError, match=r"shows s\[3\]"):
+        policy.infer(drawn, "s[2] | s[3]")
+
+
+def test_statistics_arrive_on_the_models_device(tiny_policy):
+    """The arithmetic of `fill` on another device than the dataset's; `meta` stands in for a GPU."""
+    policy = tiny_policy("continuous").to("meta")
+    stats = {key: value for key, value in CONTINUOUS_STATS.items() if key not in ("frame_index", "timestamp")}
+    policy.statistics.fill(stats)
+    assert policy.statistics.get_buffer("s_mean").device.type == "meta"
+
+
+def test_categories_that_the_data_exceed_are_refused(tiny_policy):
+    with pytest.raises(ValueError, match=r"observation\.state reaches \[16\.0, 3\.0\]"):
+        tiny_policy().statistics.fill({"observation.state": {"max": [16, 3]}})
+
+
+def test_an_inference_mask_that_needs_values_says_so_when_the_policy_is_made(tiny_policy, caplog):
+    tiny_policy(inference_mask="reward_conditioned")
+    assert "shows rtg[0] before a rollout has observed it" in caplog.text
+    caplog.clear()
+    tiny_policy(inference_mask="reward_conditioned", target_return=3.0)
+    assert not caplog.text
+
+
+def test_multi_task_goes_without_the_return_where_there_is_none():
+    assert len(mixture("multi_task", ("s", "a", "rtg"))) == 8
+    weights = mixture("multi_task", ("s", "a"))
+    assert "reward_conditioned" not in weights
+    assert sum(weights.values()) == pytest.approx(1)
+    with pytest.raises(MaskError, match="no factor 'rtg'"):
+        TrainingMasks("reward_conditioned", ("s", "a"), 4)
+
+
+def test_a_config_that_was_used_makes_a_policy_without_memories(tiny_policy, doorkey_root):
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.policies.factory import make_policy
+
+    config = tiny_policy().config
+    config.features = {}
+    make_policy(config, ds_meta=LeRobotDatasetMetadata("local/doorkey", root=doorkey_root))
+    assert len(UniMASKPolicy(config).episode_starts.states) == 0
+
+
+@pytest.mark.parametrize("state", [torch.tensor([[1.0], [2.0]]), torch.tensor([1.0, 2.0])])
+def test_a_one_number_state_comes_with_or_without_its_axis(state):
+    config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16)
+    config.set_dataset_feature_metadata(
+        {key: {"dtype": "float32", "shape": (1,), "names": None} for key in ("observation.state", "action")}
+    )
+    assert UniMASKPolicy(config).select_action({"observation.state": state}).shape == (2, 1)
