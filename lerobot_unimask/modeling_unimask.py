@@ -119,7 +119,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         ]
         if missing:
             logger.warning(
-                "The inference mask shows %s before a rollout has observed it: a rollout fails unless it is given, with "
+                "The inference mask shows %s before a rollout has observed it: rollouts fail unless it is given, with "
                 "%s or in each call of select_action.",
                 ", ".join(missing),
                 "target_return" if missing == ["rtg[0]"] else "given",

@@ -30,8 +30,8 @@ START = state_at((1, 2), (2, 2))
 # Name of the panel -> (question, what it is given). Only who goes down first, away from the key, meets the waypoint.
 ROLLOUTS: dict[str, tuple[str, dict[str, list[int] | float]]] = {
     "Imitation": ("a[t] | s[:t+1], a[:t]", {}),
-    "Another goal": ("a[t] | s[:t+1], a[:t], s[-1]", {"s[-1]": state_at((1, 1), (1, 1))}),
-    "A wanted return": ("a[t] | s[:t+1], a[:t], rtg[0]", {"rtg[0]": 4.0}),
+    "Another goal": ("a[t] | s[:t+1], a[:t], s[-1]", {"s[-1]": state_at((1, 4), (1, 4))}),
+    "A wanted return": ("a[t] | s[:t+1], a[:t], rtg[0]", {"rtg[0]": 2.0}),
     "A waypoint": ("a[t] | s[:t+1], a[:t], s[3]", {"s[3]": state_at((2, 4), (2, 2))}),
 }
 BACKWARDS = "Backwards"
