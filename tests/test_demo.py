@@ -17,7 +17,7 @@ from lerobot_unimask.experiments import demo
 from lerobot_unimask.masks import TASKS
 
 FILES = {"demo.json", "five_panels.png", "state_distributions.png"}
-QUESTIONS = {"imitation", "imitation, sampled actions", "return 6, sampled actions"}
+QUESTIONS = {"imitation", "imitation, sampled actions"}
 SECONDS = 5 * 60
 BYTES = 4 * 10**9
 

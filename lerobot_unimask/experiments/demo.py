@@ -130,15 +130,10 @@ def _train(output: Path, data: Path, steps: int) -> Path:
 
 
 def _evaluate(output: Path, checkpoint: Path) -> dict[str, dict]:
-    """What lerobot-eval reports for the most likely actions, for sampled ones, and for a wanted return of 6."""
+    """What lerobot-eval reports for the most likely actions and for sampled ones."""
     questions = {
         "imitation": [],
         "imitation, sampled actions": ["--policy.sample_actions=true"],
-        "return 6, sampled actions": [
-            "--policy.sample_actions=true",
-            "--policy.inference_mask=reward_conditioned",
-            "--policy.target_return=6",
-        ],
     }
     rollouts = {}
     for name, flags in questions.items():
