@@ -19,7 +19,7 @@ CONTINUOUS_HEADS = ("l2", "gaussian")
 @PreTrainedConfig.register_subclass("unimask")
 @dataclass
 class UniMASKConfig(PreTrainedConfig):
-    """Settings of a UniMASK policy. The defaults are the paper's random-mask model.
+    """Settings of a UniMASK policy. The defaults train on random masks; `configs/doorkey.yaml` has the paper's network.
 
     Raises:
         ValueError: a setting outside its range, or one that contradicts another.

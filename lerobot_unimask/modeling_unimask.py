@@ -165,7 +165,7 @@ class UniMASKPolicy(PreTrainedPolicy):
 
     def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
         """A LeRobot batch as a window of this model, in the dataset's units; see `window.make_window`."""
-        window = make_window(
+        return make_window(
             {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)},
             self.config.features,
             self.config.context_length,
@@ -173,7 +173,6 @@ class UniMASKPolicy(PreTrainedPolicy):
             fps=self.statistics.fps,
             partial=partial,
         )
-        return window
 
     @torch.no_grad()
     def infer(
