@@ -361,12 +361,16 @@ def _row_groups(lengths: np.ndarray, row_group: int) -> Iterator[tuple[slice, sl
         first = last
 
 
-def _write_provenance(root: Path, provenance: Mapping[str, Any]) -> None:
-    record = {
-        **provenance,
+def provenance_of_now() -> dict[str, str]:
+    """What wrote a dataset: the package's version and the command line."""
+    return {
         "package_version": importlib.metadata.version("lerobot_policy_unimask"),
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     }
+
+
+def _write_provenance(root: Path, provenance: Mapping[str, Any]) -> None:
+    record = {**provenance, **provenance_of_now()}
     (root / PROVENANCE_PATH).write_text(json.dumps(record, indent=4) + "\n")
 
 

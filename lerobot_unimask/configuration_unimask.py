@@ -1,19 +1,54 @@
 """The policy's one config dataclass, `--policy.type=unimask`."""
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Any
 
+from draccus import decode
+from draccus.utils import DecodingError
 from lerobot.configs import NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_PREFIX, OBS_STATE
 
 from lerobot_unimask.masks import MAX_CONTEXT, RANDOM_MASK, mixture, parse
 from lerobot_unimask.window import RETURN_TO_GO, Feature
 
+# Each network with the ways in which it can attend, its default first
+NETWORKS = {
+    "transformer": ("both", "bidirectional", "causal"),
+    "feedforward": ("bidirectional",),
+    "decision_gpt": ("causal",),
+    "decision_transformer": ("causal",),
+}
+CAUSAL_DRAWS = ("window", "update")
 TOKEN_LAYOUTS = ("stacked", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
+TAKEN = (OBS_STATE, OBS_ENV_STATE, RETURN_TO_GO)  # columns that are factors already
+
+
+class FormatVersion(int):
+    """A number of its own type, so that a checkpoint's is checked as it is read: before LeRobot's parser refuses the
+    fields that a newer format has and this code does not know."""
+
+
+FORMAT_VERSION = FormatVersion(1)  # of a checkpoint's files; it grows when older code would misread them
+
+
+@decode.register(FormatVersion)
+def _read_format(value: Any, path: Sequence[str] = ()) -> FormatVersion:
+    if not isinstance(value, int) or value < 1:
+        raise DecodingError(path, f"{value!r} is not a format's number; they count from 1.")
+    if value > FORMAT_VERSION:
+        raise DecodingError(
+            path,
+            f"This checkpoint has format {value}; lerobot_policy_unimask {version('lerobot_policy_unimask')} reads "
+            f"formats up to {FORMAT_VERSION}: upgrade it, with `pip install -U lerobot_policy_unimask`.",
+        )
+    return FORMAT_VERSION  # what will be saved
 
 
 @PreTrainedConfig.register_subclass("unimask")
@@ -50,10 +85,21 @@ class UniMASKConfig(PreTrainedConfig):
     # Act by sampling from the answer instead of taking its most likely action.
 
     # The network
-    token_layout: str = "stacked"
-    # "stacked": one token per step, made of all its factors; "separate": one token per factor and step.
+    network: str = "transformer"
+    # Or one of the paper's other architectures: "feedforward", "decision_gpt", "decision_transformer".
+    attention: str | None = None
+    # "both": training windows are read causally or in both directions, and so are questions: causally where they ask
+    # for the next token given all before it, as acting does. "bidirectional" is the paper's, "causal" acts alone. None:
+    # the network's own way, which is "both" for the transformer.
+    causal_share: float = 0.5
+    # With attention=both, the share of training windows that are read causally.
+    causal_draw: str = "window"
+    # "window": each draws whether it is read causally; "update": a batch's windows draw it together.
+    token_layout: str = "separate"
+    # "separate": one token per factor and step; "stacked", the paper's: one token per step, made of all its factors.
     fine_inputs: bool = True
-    # Continuous values come with displacements, sines and cosines; False: the plain numbers, as in the paper.
+    # Continuous values come with displacements, sines and cosines, and states are predicted as departures from the
+    # straight course of those shown; False: the plain numbers, as in the paper.
     continuous_head: str = "l2"
     # What is predicted of continuous values: "l2", a mean by the squared error, or "gaussian", a mean and a scale.
     width: int = 128
@@ -72,9 +118,17 @@ class UniMASKConfig(PreTrainedConfig):
     optimizer_grad_clip_norm: float = 1.0
     scheduler_warmup_steps: int = 200
 
+    # The data
+    properties: list[str] = field(default_factory=list)
+    # Columns that label whole episodes, observation.NAME: each is a factor NAME, shown as NAME[0] or not at all.
+
     # Read off the training dataset and saved, so that a checkpoint knows what it was trained on.
     features: dict[str, list[Feature]] = field(default_factory=dict)
     # Factor name -> the dataset's columns that make it up.
+    dataset_revision: str | None = None
+    # The commit on the Hub that the training data are of; None: they were read from a folder.
+    format_version: FormatVersion = FORMAT_VERSION
+    # Of the files of a checkpoint.
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
@@ -87,11 +141,28 @@ class UniMASKConfig(PreTrainedConfig):
             raise ValueError(f"context_length is {self.context_length}; it must lie in 1 to {MAX_CONTEXT} steps.")
         if self.drop_n_last_frames is None:
             self.drop_n_last_frames = self.context_length - 1
-        if self.token_layout not in TOKEN_LAYOUTS:
-            raise ValueError(f"token_layout is {self.token_layout!r}; choose one of {', '.join(TOKEN_LAYOUTS)}.")
-        if self.continuous_head not in CONTINUOUS_HEADS:
+        if self.network not in NETWORKS:
+            raise ValueError(f"network is {self.network!r}; choose one of {', '.join(NETWORKS)}.")
+        if self.attention is None:
+            self.attention = NETWORKS[self.network][0]
+        for name, choices in {
+            "attention": NETWORKS[self.network],
+            "causal_draw": CAUSAL_DRAWS,
+            "token_layout": TOKEN_LAYOUTS,
+            "continuous_head": CONTINUOUS_HEADS,
+        }.items():
+            if getattr(self, name) not in choices:
+                of = f" with network={self.network}" if name == "attention" else ""
+                raise ValueError(f"{name} is {getattr(self, name)!r}; choose one of {', '.join(choices)}{of}.")
+        if self.token_layout == "stacked" and self.attention != "bidirectional":
             raise ValueError(
-                f"continuous_head is {self.continuous_head!r}; choose one of {', '.join(CONTINUOUS_HEADS)}."
+                "token_layout=stacked needs attention=bidirectional: a step's state and action are one token there, "
+                "so the state cannot be seen before the action."
+            )
+        if not 0 < self.causal_share < 1:
+            raise ValueError(
+                f"causal_share is {self.causal_share}; it must lie between 0 and 1. For none or all use "
+                "attention=bidirectional or causal."
             )
         for name in ("width", "depth", "heads", "feedforward_width"):
             if getattr(self, name) < 1:
@@ -141,7 +212,7 @@ class UniMASKConfig(PreTrainedConfig):
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
         """
         found = {key: _feature(key, entry) for key, entry in dataset_features.items() if _numeric(entry)}
-        features = _group(found)
+        features = _group(found, self.properties)
         if self.features and features != self.features:
             raise ValueError(
                 "This checkpoint was trained on other features than the dataset has.\n"
@@ -158,7 +229,7 @@ class UniMASKConfig(PreTrainedConfig):
         if not self.features:
             declared = {**(self.input_features or {}), **(self.output_features or {})}
             sizes = {key: feature for key, feature in declared.items() if len(feature.shape) <= 1}
-            self.features = _group({key: _declared(key, feature) for key, feature in sizes.items()})
+            self.features = _group({key: _declared(key, feature) for key, feature in sizes.items()}, self.properties)
 
 
 def _numeric(entry: dict[str, Any]) -> bool:
@@ -167,7 +238,7 @@ def _numeric(entry: dict[str, Any]) -> bool:
 
 def _feature(key: str, entry: dict[str, Any]) -> Feature:
     size = entry["shape"][0] if entry["shape"] else 1
-    categories = entry.get("categories")
+    categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
     if categories is not None and len(categories) != size:
         raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
     names = entry.get("names")
@@ -179,7 +250,7 @@ def _declared(key: str, feature: PolicyFeature) -> Feature:
     return Feature(key, feature.shape[0] if feature.shape else 1)
 
 
-def _group(found: dict[str, Feature]) -> dict[str, list[Feature]]:
+def _group(found: dict[str, Feature], properties: Sequence[str]) -> dict[str, list[Feature]]:
     """Which factor each column belongs to. `s` is what LeRobot calls the robot's and the environment's state: a label
     of the episode under another name must never slip into it, for no environment reports one."""
     states = [found[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in found]
@@ -190,6 +261,22 @@ def _group(found: dict[str, Feature]) -> dict[str, list[Feature]]:
     features = {"s": states, "a": [found[ACTION]]}
     if RETURN_TO_GO in found:
         features["rtg"] = [found[RETURN_TO_GO]]
+    for key in properties:
+        name = key.rpartition(".")[-1]
+        if key not in found:
+            others = [other for other in found if other.startswith(OBS_PREFIX) and other not in TAKEN]
+            raise ValueError(
+                f"properties names {key!r}, which the dataset does not have; columns that could be one: "
+                f"{', '.join(others) or 'none'}. `unimask label` adds one."
+            )
+        if key in TAKEN or found[key] in features.get(name, []):
+            raise ValueError(f"{key!r} is a factor already, so it cannot be named in properties as well.")
+        if not key.startswith(OBS_PREFIX) or not re.fullmatch(r"[A-Za-z_]\w*", name) or name in ("t", "rtg", *features):
+            raise ValueError(
+                f"{key!r} cannot be a property: it is named observation.NAME, NAME is letters, digits and "
+                f"underscores, and s, a, t, rtg and other properties' names are taken."
+            )
+        features[name] = [found[key]]
     return features
 
 

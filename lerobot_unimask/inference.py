@@ -1,12 +1,12 @@
 """Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
 
-Acting is a question asked at every step, so everything here goes through `predict`; there is no second path.
+Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
 
 Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,10 +14,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from lerobot_unimask.masks import ASKABLE, Mask, parse_token
+from lerobot_unimask.networks.transformer import Cache, Predictions
 from lerobot_unimask.window import Component, Factor, Statistics, Window
 
 ORDERS = ("forward", "backward", "random")
-Network = Callable[[Window, dict[str, Tensor]], dict[str, list[Tensor]]]
+# A model: (window with normalised values, mask, cache of a rollout) -> predictions. `UniMASKPolicy.predict` is one.
+Predict = Callable[[Window, Mask, Cache | None], Predictions]
+# (values, decided): factor -> (n, K, D) and (n, K) bool -> (n,) bool, False where the decided tokens contradict it
+Check = Callable[[Mapping[str, Tensor], Mapping[str, Tensor]], Tensor]
 Given = Mapping[str, Any]  # token text -> its value, shared (D,) or one per environment (B, D); a number where D = 1
 
 
@@ -44,6 +48,12 @@ class Distribution:
             return self.mean
         best = self.probabilities.nan_to_num(-1.0).argmax(-1, keepdim=True).to(self.probabilities.dtype)
         return torch.where(self.probabilities.isnan().any(-1, keepdim=True), torch.nan, best)
+
+    def at(self, rows: Tensor, step: int) -> "Distribution":
+        """That of some windows, (n,) their numbers, at one step: (n, 1, ...)."""
+        parts = {name: getattr(self, name) for name in ("probabilities", "mean", "scale")}
+        chosen = {name: None if part is None else part[rows, step : step + 1] for name, part in parts.items()}
+        return replace(self, **chosen)
 
     def draw(self, generator: torch.Generator | None) -> Tensor:
         """One sample for each step, (B, K, d). An L2 head has no spread: there it is the mean."""
@@ -77,10 +87,19 @@ class Answer:
 
 
 def answer(
-    network: Network, statistics: Statistics, factors: Mapping[str, Factor], window: Window, mask: Mask
+    predict: Predict,
+    statistics: Statistics,
+    factors: Mapping[str, Factor],
+    window: Window,
+    mask: Mask,
+    cache: Cache | None = None,
 ) -> Answer:
-    """The distribution of every asked-for token given the shown ones."""
-    predictions = network(statistics.normalise(window), mask.visible)
+    """The distribution of every asked-for token given the shown ones.
+
+    Args:
+        cache: of the rollout that asks.
+    """
+    predictions = predict(statistics.normalise(window), mask, cache)
     distributions = {}
     for name, outputs in predictions.items():
         shown = mask.visible[name].unsqueeze(-1)
@@ -104,8 +123,27 @@ def answer(
     return Answer(mask, distributions)
 
 
+@dataclass
+class Samples(Window):
+    """Drawn windows: shown and drawn values, NaN elsewhere; and what the check cost.
+
+    drawn: tokens drawn, those that the check rejected included.
+    rejected: of these, how many it rejected.
+    restarted: how often a sample started over because no value of a token passed the check.
+    """
+
+    drawn: int = 0
+    rejected: int = 0
+    restarted: int = 0
+
+    @property
+    def acceptance(self) -> float:
+        """The share of drawn tokens that the check accepted."""
+        return 1 - self.rejected / max(self.drawn, 1)
+
+
 def sample(
-    network: Network,
+    predict: Predict,
     statistics: Statistics,
     factors: Mapping[str, Factor],
     window: Window,
@@ -113,22 +151,31 @@ def sample(
     *,
     order: str,
     generator: torch.Generator,
-) -> Window:
+    check: Check | None = None,
+    tries: int = 100,
+) -> Samples:
     """Draw the asked-for tokens one after another, each given the shown ones and those already drawn (chain rule).
 
-    A token's own components (agent and key, say) are drawn side by side from their marginals.
+    A token's own components (agent and key, say) are drawn side by side from their marginals. With a check, a token
+    that contradicts what is shown or already drawn is drawn again (the paper's repair of backward inference, appendix
+    "Fixing prediction inconsistencies"), and a sample in a dead end starts over.
+
+    Note: Rejection looks at what is decided so far and not ahead, so the accepted samples are not quite distributed as
+        all samples that happen to pass are.
 
     Args:
         order: `forward` in time (s0, a0, s1, ...), `backward`, or `random` (one order for the whole batch).
-
-    Returns:
-        The window with shown and drawn values, NaN elsewhere.
+        check: tells which samples contradict themselves; called after each drawn token with the samples that drew it.
+        tries: how often one token is drawn before its sample starts over, and how often a sample starts before all is
+            given up.
 
     Raises:
-        ValueError: an unknown order.
+        ValueError: an unknown order, or a check that what is shown, or every start of some sample, fails.
     """
     if order not in ORDERS:
         raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
+    if tries < 1:
+        raise ValueError(f"tries is {tries}; it must be at least 1.")
     asked = torch.stack([mask.predict[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
     tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
     if order == "backward":
@@ -136,18 +183,57 @@ def sample(
     elif order == "random":
         shuffle = torch.randperm(len(tokens), generator=generator, device=generator.device).tolist()
         tokens = [tokens[i] for i in shuffle]
-    visible = {name: shown.clone() for name, shown in mask.visible.items()}
-    values = {name: torch.where(visible[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()}
-    drawn = Window(values, window.valid)
-    for name, step in tokens:
-        here = torch.zeros_like(mask.predict[name])
-        here[:, step] = mask.predict[name][:, step]
-        nothing = {other: torch.zeros_like(here) for other in mask.predict}
-        step_answer = answer(network, statistics, factors, drawn, Mask(visible, nothing | {name: here}))
-        value = torch.cat([distribution.draw(generator) for distribution in step_answer[name]], dim=-1)
-        values[name] = torch.where(here.unsqueeze(-1), value, values[name])
-        visible[name] = visible[name] | here
-    return drawn
+    shown = {name: visible.unsqueeze(-1) for name, visible in mask.visible.items()}
+    samples = Samples({name: torch.where(shown[name], v, torch.nan) for name, v in window.values.items()}, window.valid)
+    if check is not None and not check(samples.values, mask.visible).all():
+        raise ValueError(
+            "By the check what is shown is impossible already, so no sample can pass: show something else."
+        )
+
+    def start(rows: Tensor) -> Tensor:
+        """Draw all tokens of some samples, (n,) their numbers, and return those that got stuck."""
+        stuck = [rows[:0]]
+        values = {name: value[rows] for name, value in samples.values.items()}
+        visible = {name: shown[rows] for name, shown in mask.visible.items()}
+        for name, step in tokens:
+            here = torch.zeros_like(visible[name])
+            here[:, step] = mask.predict[name][rows, step]
+            nothing = {other: torch.zeros_like(here) for other in visible}
+            posed = Mask(visible, nothing | {name: here})
+            said = answer(predict, statistics, factors, Window(values, samples.valid[rows]), posed)
+            visible = visible | {name: visible[name] | here}
+            redraw = here[:, step].nonzero().squeeze(-1)
+            for _ in range(tries):
+                value = torch.cat([distribution.at(redraw, step).draw(generator) for distribution in said[name]], -1)
+                values[name][redraw, step] = value[:, 0]
+                samples.drawn += len(redraw)
+                redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(visible, redraw))]
+                samples.rejected += len(redraw)
+                if len(redraw) == 0:
+                    break
+            else:
+                going_on = torch.ones_like(rows, dtype=torch.bool).index_fill(0, redraw, False)
+                stuck.append(rows[~going_on])
+                values, visible, rows = _rows(values, going_on), _rows(visible, going_on), rows[going_on]
+        for name in ASKABLE:
+            samples.values[name][rows] = values[name]
+        return torch.cat(stuck)
+
+    rows = torch.arange(len(window.valid), device=window.valid.device)
+    for _ in range(tries):
+        rows = start(rows)
+        if len(rows) == 0:
+            return samples
+        samples.restarted += len(rows)
+    raise ValueError(
+        f"{len(rows)} of {len(window.valid)} samples did not pass the check, each started {tries} times; it rejected "
+        f"{samples.rejected} of {samples.drawn} drawn tokens. The model finds what is shown hard to reconcile with it: "
+        "show something likelier, draw in another order, or raise tries."
+    )
+
+
+def _rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    return {name: tensor[rows] for name, tensor in tensors.items()}
 
 
 # --- Values that a user gives ----------------------------------------------------------------------------------------
@@ -284,6 +370,7 @@ class RolloutMemory:
         self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
         self.target_return: Tensor | None = None  # (B, 1) or (1, 1): asked for from the first step on
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
+        self.cache = Cache()  # of the steps in the window, until it slides
 
     @property
     def position(self) -> int:
@@ -308,6 +395,7 @@ class RolloutMemory:
                 for name in ASKABLE:
                     self.values[name] = self.values[name].roll(-1, dims=1)
                 self.return_so_far = self.return_so_far.roll(-1, dims=1)
+                self.cache = Cache()
             self.acted = False
         self.values["s"][:, self.position] = state.clone()
         self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
@@ -329,8 +417,15 @@ class RolloutMemory:
         values = dict(self.values)
         if "rtg" in values:
             values["rtg"] = values["rtg"].clone()
-            values["rtg"][:, 0, -1] = self.first_step / horizon
+            values["rtg"][..., -1] = (self.first_step + torch.arange(self.valid.shape[1]).to(horizon)) / horizon
         return Window(values, self.valid)
+
+    def carry_return(self, window: Window) -> None:
+        """Write into a window what is left of its first step's return at the later steps, NaN where nobody has reported
+        the rewards since. No mask shows it; a Decision Transformer reads it."""
+        if "rtg" in window.values:
+            received = self.return_so_far[:, 1:] - self.return_so_far[:, :1]  # (B, K - 1)
+            window.values["rtg"][:, 1:, 0] = window.values["rtg"][:, :1, 0] - received
 
     def remaining(self, target_return: Tensor) -> Tensor:
         """What is left of the target return at the window's first step, (B, 1).

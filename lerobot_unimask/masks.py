@@ -275,6 +275,13 @@ class MaskTable:
         always = torch.ones_like(steps > t)
         return {name: (self.visible[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
 
+    def masks(self) -> "Mask":
+        """Every row as one batch of masks."""
+        return Mask(
+            dict(zip(self.factors, self.visible.unbind(1), strict=True)),
+            dict(zip(self.factors, self.predict.unbind(1), strict=True)),
+        )
+
     def at(self, t: int | None, batch_size: int = 1) -> "Mask":
         """The mask at step t for each window of a batch.
 
@@ -396,27 +403,46 @@ class Mask:
     imitation at t = 2 in a window of six steps, `#` shown, `?` asked, `.` neither:
 
         s ###..#  a ##?...
+
+    `causal`, one bool or (B,), says which windows are read causally: each asked token sees only what is shown before it
+    in the order properties, s0, a0, s1, a1, ...; so one window may show a token to those after it and ask for it too.
     """
 
     visible: dict[str, Tensor]
     predict: dict[str, Tensor]
+    causal: Tensor | bool = False
 
     def within(self, valid: Tensor) -> "Mask":
         """The same mask with steps outside the episode, `valid` (B, K) False, neither shown nor asked."""
         visible = {name: shown & valid for name, shown in self.visible.items()}
         predict = {name: asked & valid for name, asked in self.predict.items()}
-        return Mask(visible, predict)
+        return Mask(visible, predict, self.causal)
 
     def repeat(self, times: int) -> "Mask":
         """Each window's mask `times` times, one after another."""
         visible = {name: shown.repeat_interleave(times, dim=0) for name, shown in self.visible.items()}
-        return Mask(visible, {name: asked.repeat_interleave(times, dim=0) for name, asked in self.predict.items()})
+        predict = {name: asked.repeat_interleave(times, dim=0) for name, asked in self.predict.items()}
+        causal = self.causal if isinstance(self.causal, bool) else self.causal.repeat_interleave(times, dim=0)
+        return Mask(visible, predict, causal)
 
     def to(self, device: torch.device) -> "Mask":
         return Mask(
             {name: shown.to(device) for name, shown in self.visible.items()},
             {name: asked.to(device) for name, asked in self.predict.items()},
+            self.causal if isinstance(self.causal, bool) else self.causal.to(device),
         )
+
+    def next_tokens(self) -> dict[str, Tensor]:
+        """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and
+        action before it and none after; properties may be shown or not."""
+        shown, asked = (
+            torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1)
+            for tokens in (self.visible, self.predict)
+        )  # (B, 2 K), in the order of time
+        order = torch.arange(shown.shape[1], device=shown.device)
+        count = shown.sum(1, keepdim=True)
+        history = shown.any(1, keepdim=True) & (shown == (order < count)).all(1, keepdim=True)
+        return dict(zip(ASKABLE, (history & asked & (order == count)).unflatten(1, (-1, 2)).unbind(-1), strict=True))
 
     def draw(self, window: int = 0) -> str:
         """One window's mask as text, in the notation of the class's docstring."""
@@ -430,34 +456,96 @@ class Mask:
 class TrainingMasks(nn.Module):
     """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
 
+    A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
+    apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
+    cloning does. The causal form of random masking shows all states and actions, each property with probability 1/2,
+    and asks for every token but the first state.
+
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
             of a task, `random_mask`, or a regime's name (`multi_task`: the eight tasks, sharing its weight; without a
             return factor, seven).
         factors: the model's factors.
         context_length: K.
+        causal_share: of the windows, or of the updates, that are causal.
+        causal_draw: `window`, each draws whether it is causal; `update`, all of an update's together.
 
     Raises:
-        MaskError: a text that does not fit the model.
+        MaskError: a text that does not fit the model, or with a causal share of 1 has no causal form.
         ValueError: no masks, or weights that are not positive numbers.
     """
 
-    def __init__(self, masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[str], context_length: int):
+    def __init__(
+        self,
+        masks: str | Sequence[str] | Mapping[str, float],
+        factors: Sequence[str],
+        context_length: int,
+        *,
+        causal_share: float = 0.0,
+        causal_draw: str = "window",
+    ):
         super().__init__()
         self.factors = tuple(factors)
         self.weights = mixture(masks, self.factors)
-        tables = [tabulate(text, self.factors, context_length) for text in self.weights if text != RANDOM_MASK]
-        tasks = [task for task, text in enumerate(self.weights) if text != RANDOM_MASK]
-        self.random_task = list(self.weights).index(RANDOM_MASK) if RANDOM_MASK in self.weights else None
+        tables = {text: tabulate(text, self.factors, context_length) for text in self.weights if text != RANDOM_MASK}
+        tasks = {text: task for task, text in enumerate(self.weights)}
+        self.random_task = tasks.get(RANDOM_MASK)
         empty = torch.zeros(0, len(self.factors), context_length, dtype=torch.bool)
         weights = torch.tensor(list(self.weights.values()), dtype=torch.float64)
         # Worked out from the config, so not part of the checkpoint.
-        self.register_buffer("visible", torch.cat([empty, *(table.visible for table in tables)]), persistent=False)
-        self.register_buffer("predict", torch.cat([empty, *(table.predict for table in tables)]), persistent=False)
-        task_of_row = [task for task, table in zip(tasks, tables, strict=True) for _ in table.t]
-        self.register_buffer("task_of_row", torch.tensor(task_of_row, dtype=torch.int64), persistent=False)
-        shares = (weights / weights.sum()).cumsum(0)[:-1].float()
-        self.register_buffer("cumulative_weights", shares, persistent=False)
+        self._keep("visible", torch.cat([empty, *(table.visible for table in tables.values())]))
+        self._keep("predict", torch.cat([empty, *(table.predict for table in tables.values())]))
+        self._keep("task_of_row", torch.tensor([tasks[text] for text in tables for _ in tables[text].t]).long())
+        self._keep("cumulative_weights", _cumulative(weights))
+        forms = [self._causal_form(tables.get(text), context_length) for text in self.weights]
+        capable = torch.tensor([form is not None for form in forms])
+        if causal_share == 1 and not capable.all():
+            text = list(self.weights)[forms.index(None)]
+            raise MaskError(
+                "A model that attends causally alone is trained on questions that ask for one token and show every "
+                "state and action before it, such as behavior_cloning, reward_conditioned or random_mask; this one "
+                "is not.",
+                TASKS.get(text, text),
+            )
+        self.causal_share = causal_share if capable.any() else 0.0
+        self.causal_draw = causal_draw
+        nothing = (empty.new_zeros(empty.shape[1:]),) * 2
+        visible, predict = zip(*(form or nothing for form in forms), strict=True)
+        self._keep("causal_visible", torch.stack(visible))  # (T, F, K) for each of the tasks
+        self._keep("causal_predict", torch.stack(predict))
+        self._keep("causal_row", capable[self.task_of_row])
+        self._keep("causal_cumulative_weights", _cumulative(weights * capable) if capable.any() else torch.zeros(0))
+
+    def _keep(self, name: str, tensor: Tensor) -> None:
+        self.register_buffer(name, tensor, persistent=False)
+
+    def _causal_form(self, table: "MaskTable | None", K: int) -> tuple[Tensor, Tensor] | None:
+        """What a causal window of this task, None for random masking, shows and asks for: two (F, K), or None."""
+        if table is None:
+            visible = torch.ones(len(self.factors), K, dtype=torch.bool)
+            predict = torch.tensor([name in ASKABLE for name in self.factors])[:, None].repeat(1, K)
+            predict[self.factors.index("s"), 0] = False  # nothing of the window comes before it
+            visible[[f for f, name in enumerate(self.factors) if name not in ASKABLE], 1:] = False
+            return visible, predict
+        mask = table.masks()
+        following = mask.next_tokens()
+        if any((following[name] != mask.predict[name]).any() for name in ASKABLE):
+            return None
+        return table.visible.any(0), table.predict.any(0)
+
+    def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
+        """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
+        causally. All else it answers in both directions."""
+        following = mask.next_tokens()
+        if self.causal_share > 0 and self.random_task is not None:
+            return following
+        learnt = self.causal_row & (self.causal_share > 0)  # (R,)
+        visible = torch.stack([mask.visible[name] for name in self.factors], dim=1)  # (B, F, K)
+        same = (visible[:, None] == self.visible).all((2, 3)) & learnt  # (B, R)
+        return {
+            name: tokens & (same.float() @ self.predict[:, self.factors.index(name)].float() > 0)
+            for name, tokens in following.items()
+        }
 
     def forward(self, valid: Tensor, index: Tensor, *, seed: int, step: Tensor | int) -> Mask:
         """Draw a mask for each window.
@@ -470,21 +558,36 @@ class TrainingMasks(nn.Module):
         """
         B, K = valid.shape
         F = len(self.factors)
-        uniform = counter_uniform(seed, step, index, 3 + F * K)  # (B, 3 + F K)
+        uniform = counter_uniform(seed, step, index, 4 + F * K)  # (B, 4 + F K)
         task = torch.searchsorted(self.cumulative_weights, uniform[:, 0].contiguous(), right=True)  # (B,)
         visible = valid.new_zeros(B, F, K)
         predict = valid.new_zeros(B, F, K)
         if len(self.visible):
             visible, predict = self._question_masks(valid, task, uniform[:, 1])
+        hidden = self._hidden(uniform[:, 2], uniform[:, 3:-1].view(B, F, K))
+        askable = torch.tensor([name in ASKABLE for name in self.factors], device=valid.device)[:, None]
         if self.random_task is not None:
             chosen = (task == self.random_task)[:, None, None]
-            hidden = self._hidden(uniform[:, 2], uniform[:, 3:].view(B, F, K))
-            askable = torch.tensor([name in ASKABLE for name in self.factors], device=valid.device)[:, None]
             visible = torch.where(chosen, ~hidden, visible)
             predict = torch.where(chosen, hidden & askable, predict)
-        visible, predict = visible.unbind(1), predict.unbind(1)
-        mask = Mask(dict(zip(self.factors, visible, strict=True)), dict(zip(self.factors, predict, strict=True)))
-        return mask.within(valid)
+        causal: Tensor | bool = False
+        if self.causal_share > 0:
+            causal = self._draw_causal(uniform[:, -1], seed, step)  # (B,)
+            task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
+            shown = self.causal_visible[task]
+            if self.random_task is not None:
+                shown = shown & (askable | ~hidden | (task != self.random_task)[:, None, None])
+            visible = torch.where(causal[:, None, None], shown, visible)
+            predict = torch.where(causal[:, None, None], self.causal_predict[task], predict)
+        visible, predict = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (visible, predict))
+        return Mask(visible, predict, causal).within(valid)
+
+    def _draw_causal(self, uniform: Tensor, seed: int, step: Tensor | int) -> Tensor:
+        """(B,) bool, which windows are causal."""
+        if self.causal_draw == "update":
+            one = torch.full((1,), -1, dtype=torch.int64, device=uniform.device)  # no frame's index
+            uniform = counter_uniform(seed, step, one, 1)[:, 0].expand_as(uniform)
+        return uniform < self.causal_share
 
     def _question_masks(self, valid: Tensor, task: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """One row per window, uniform among those of its task that ask for something valid: two (B, F, K)."""
@@ -505,6 +608,11 @@ class TrainingMasks(nn.Module):
                 hidden[:, f, 0] = uniform[:, f, 0] < 0.5
                 hidden[:, f, 1:] = True
         return hidden
+
+
+def _cumulative(weights: Tensor) -> Tensor:
+    """Where the unit interval is cut so that each task gets its share, for `searchsorted`: (T - 1,)."""
+    return (weights / weights.sum()).cumsum(0)[:-1].float()
 
 
 def mixture(masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[str] | None = None) -> dict[str, float]:

@@ -1,25 +1,35 @@
 """UniMASKPolicy: the masked model behind LeRobot's policy contract, and the questions that one can ask it."""
 
+import json
 import logging
 import operator
+import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from draccus.utils import DecodingError, ParsingError
+from huggingface_hub.constants import CONFIG_NAME
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lerobot_unimask import inference
+from lerobot_unimask import hub, inference
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.inference import Answer, Given, RolloutMemory
+from lerobot_unimask.inference import Answer, Check, Given, RolloutMemory, Samples
 from lerobot_unimask.losses import masked_losses
 from lerobot_unimask.masks import Mask, MaskError, MaskTable, TrainingMasks, tabulate
-from lerobot_unimask.networks.transformer import Transformer
+from lerobot_unimask.networks import make_network
+from lerobot_unimask.networks.transformer import Cache, Predictions
+from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 from lerobot_unimask.returns import EpisodeStarts, read_starts
 from lerobot_unimask.window import RETURN_SO_FAR, RETURN_TO_GO, Statistics, Window, make_factors, make_window
 
@@ -65,28 +75,27 @@ class UniMASKPolicy(PreTrainedPolicy):
         self.statistics = Statistics(config.features, self.factors, config.context_length)
         self.episode_starts = EpisodeStarts(self.factors["s"].size)
         self._read_dataset(dataset_stats, dataset_meta)
-        self.training_masks = TrainingMasks(config.training_masks, tuple(self.factors), config.context_length)
-        self.network = Transformer(
-            self.factors,
-            context_length=config.context_length,
-            stacked=config.token_layout == "stacked",
-            fine_inputs=config.fine_inputs,
-            width=config.width,
-            depth=config.depth,
-            heads=config.heads,
-            feedforward_width=config.feedforward_width,
-            dropout=config.dropout,
+        self.training_masks = TrainingMasks(
+            config.training_masks,
+            tuple(self.factors),
+            config.context_length,
+            causal_share={"bidirectional": 0.0, "both": config.causal_share, "causal": 1.0}[config.attention],
+            causal_draw=config.causal_draw,
         )
+        self.network = make_network(config, self.factors)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
         # What to ask for at the start of an episode: as the config says, or a function of its first states, (B, D) ->
         # (B, 1), both in the dataset's units, which Python alone can set.
         self.target_return: float | str | Callable[[Tensor], Tensor] | None = config.target_return
+        self.origin: hub.Origin | None = None  # where it was loaded from
         self.reset()
 
     def _read_dataset(self, stats: Mapping[str, Mapping[str, Any]] | None, meta: LeRobotDatasetMetadata | None) -> None:
         """Take over what is kept of a training dataset: its statistics, and its episodes' starts and returns."""
         if stats is not None:
             self.statistics.fill(stats)
+        if meta is not None:
+            self.config.dataset_revision = hub.commit_of(Path(meta.root))
         if meta is not None and "rtg" in self.factors:
             starts = read_starts(Path(meta.root), [f.key for f in self.config.features["s"]], RETURN_TO_GO)
             if starts is not None:
@@ -148,7 +157,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         step = self.updates if self.training else VALIDATION_STEP
         mask = self.training_masks(window.valid, _index(batch, window), seed=self.config.mask_seed, step=step)
         window = self.statistics.normalise(window)
-        predictions = self.network(window, mask.visible)
+        predictions = self.network(window, mask.visible, mask.causal)
         losses = masked_losses(predictions, window, mask.predict, self.factors)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
         parts = torch.stack(list(losses.values())).tolist()  # one synchronisation with the device, not one for each
@@ -162,6 +171,36 @@ class UniMASKPolicy(PreTrainedPolicy):
         return self.parameters()
 
     # --- Asking ------------------------------------------------------------------------------------------------------
+
+    def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
+        """What the network puts out for each asked-for token. A token that follows a history shown in full is predicted
+        causally, where the model has learnt that, and every other one in both directions; so a token's answer does not
+        depend on what else is asked.
+
+        Args:
+            window: normalised values.
+            cache: of the rollout that asks; what it holds of a causal prediction is not computed again.
+
+        Raises:
+            MaskError: the model attends causally alone and has not learnt to answer this.
+        """
+        causally = self.training_masks.answered_causally(mask)
+        if all(torch.equal(causally[name], mask.predict[name]) for name in causally):
+            return self.network(window, mask.visible, True, cache)
+        if self.config.attention == "causal":
+            raise MaskError(
+                "This model attends causally alone. It was trained on "
+                f"{', '.join(self.training_masks.weights)}, and asks for one token given every state and action before "
+                "it. A model of attention=both answers any question.",
+                mask.draw(),
+            )
+        predictions = self.network(window, mask.visible, False)
+        if any(tokens.any() for tokens in causally.values()):
+            for name, outputs in self.network(window, mask.visible, True).items():
+                here = causally[name].unsqueeze(-1)
+                pairs = zip(outputs, predictions[name], strict=True)
+                predictions[name] = [torch.where(here, causal, other) for causal, other in pairs]
+        return predictions
 
     def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
         """A LeRobot batch as a window of this model, in the dataset's units; see `window.make_window`."""
@@ -199,7 +238,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """
         window, mask = self._pose(window, mask, t, given)
         with _evaluation(self):
-            return inference.answer(self.network, self.statistics, self.factors, window, mask)
+            return inference.answer(self.predict, self.statistics, self.factors, window, mask)
 
     @torch.no_grad()
     def sample(
@@ -212,23 +251,39 @@ class UniMASKPolicy(PreTrainedPolicy):
         samples: int = 1,
         order: str = "forward",
         seed: int = 0,
-    ) -> Window:
+        check: Check | None = None,
+        tries: int = 100,
+    ) -> Samples:
         """Draw the asked-for tokens jointly, one after another by the chain rule; see `infer` for the other arguments.
 
         Args:
             samples: how many of each window; those of a window stand together in the result, (B * samples, K, D).
             order: `forward` in time, `backward` or `random`.
             seed: the same seed draws the same samples.
+            check: what a sample must not contradict: what it rejects is drawn again, see `inference.sample`.
+            tries: bounds how often.
 
         Returns:
-            A window in the dataset's units: shown values as they were, drawn ones where asked, NaN elsewhere.
+            A window in the dataset's units: shown values as they were, drawn ones where asked, NaN elsewhere; with the
+            numbers of tokens drawn and rejected, and of samples started over.
+
+        Raises:
+            ValueError: also where the check cannot be met.
         """
         window, mask = self._pose(window, mask, t, given)
         window, mask = window.repeat(samples), mask.repeat(samples)
         generator = torch.Generator(self.device).manual_seed(seed)
         with _evaluation(self):
             return inference.sample(
-                self.network, self.statistics, self.factors, window, mask, order=order, generator=generator
+                self.predict,
+                self.statistics,
+                self.factors,
+                window,
+                mask,
+                order=order,
+                generator=generator,
+                check=check,
+                tries=tries,
             )
 
     def _pose(
@@ -241,6 +296,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             rows = (len(token) for token in inference.read_given(given or {}, self.factors, K).values())
             empty = RolloutMemory(self.factors, K, max(rows, default=1), self.device)
             window = empty.window(self.statistics.horizon)
+            empty.carry_return(window)
         elif not isinstance(window, Window):
             window = self.make_window(window, partial=True)
         if window.valid.shape[1] != K:
@@ -340,10 +396,13 @@ class UniMASKPolicy(PreTrainedPolicy):
             if target is not None:
                 tokens["rtg", 0] = memory.remaining(target.to(self.device))
         window, known = inference.give(memory.window(self.statistics.horizon), tokens, memory.known())
+        memory.carry_return(window)
         posed = table.at(memory.position, len(state))
         inference.check_known(posed, known, text)
         with _evaluation(self):
-            answer = inference.answer(self.network, self.statistics, self.factors, window, posed.to(self.device))
+            answer = inference.answer(
+                self.predict, self.statistics, self.factors, window, posed.to(self.device), memory.cache
+            )
         chosen = self.config.sample_actions if sample is None else sample
         parts = [d.draw(generator) if chosen else d.most_likely for d in answer["a"]]
         action = torch.cat(parts, dim=-1)[:, memory.position]  # (B, D)
@@ -405,13 +464,62 @@ class UniMASKPolicy(PreTrainedPolicy):
         Args:
             dataset_stats, dataset_meta: of the dataset to go on with (fine-tuning): what they say of it replaces what
                 the checkpoint kept of its own.
+            kwargs: of the base class: `config`, `revision`, `token`, `local_files_only`, ...
 
         Raises:
-            ValueError: the weights are not this model's: names every missing, extra or misshapen tensor.
+            HubError: a repository, revision or file is missing or damaged, or there is no folder of that name.
+            ValueError: the config is not one of this policy, or the weights are not its: names every missing, extra or
+                misshapen tensor.
         """
-        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
+        config = kwargs.pop("config", None)
+        revision = kwargs.pop("revision", None)
+        folder = Path(pretrained_name_or_path)
+        if not folder.is_dir():
+            names = ("force_download", "token", "cache_dir", "local_files_only")
+            download = {name: kwargs.pop(name) for name in names if name in kwargs}
+            folder = hub.fetch(str(pretrained_name_or_path), revision=revision, **download)
+        policy = super().from_pretrained(folder, config=config or _read_config(folder), **kwargs)
         policy._read_dataset(dataset_stats, dataset_meta)
+        policy.origin = hub.Origin(str(pretrained_name_or_path), hub.commit_of(folder))
         return policy
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """Config, weights and processors: all that acting needs."""
+        super()._save_pretrained(save_directory, state_dict=state_dict)
+        for pipeline in make_unimask_pre_post_processors(self.config):
+            pipeline.save_pretrained(save_directory)
+
+    def push_model_to_hub(
+        self,
+        cfg: TrainPipelineConfig,
+        peft_model: Any = None,
+        state_dict: dict[str, Tensor] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        """Push a finished training's policy, its processors and its card in one commit; lerobot-train calls this.
+
+        Note: LeRobot's own asks a fixed public address to validate the card, and leaves the processors to later
+        commits, so until then nobody can use the policy.
+
+        Raises:
+            HubError: it could not be pushed. Nothing of it is to be seen on the Hub then.
+        """
+        if peft_model is not None:  # an adapter is LeRobot's to save
+            super().push_model_to_hub(cfg, peft_model, state_dict, dataset_meta)
+            return
+        name = Path(sys.argv[0]).name
+        with TemporaryDirectory() as folder:
+            self.save_pretrained(folder, state_dict=state_dict)
+            cfg.save_pretrained(folder)
+            url = hub.push_policy(
+                self,
+                Path(folder),
+                self.config.repo_id,
+                private=self.config.private,
+                command=shlex.join([name, *sys.argv[1:]]) if name == "lerobot-train" else None,
+                saved=Path(cfg.output_dir),
+            )
+        logging.info("Model pushed to %s", url)  # LeRobot's remote jobs watch for these words
 
     @classmethod
     def _load_as_safetensor(
@@ -436,6 +544,26 @@ class UniMASKPolicy(PreTrainedPolicy):
             raise ValueError(f"The weights in {model_file} are not those of its config: {'; '.join(faults)}.")
         model.load_state_dict(weights)
         return model
+
+
+def _read_config(folder: Path) -> UniMASKConfig:
+    """A checkpoint's config.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is not one of this policy. Says what is wrong; LeRobot's parser hides that behind its own words.
+    """
+    path = folder / CONFIG_NAME
+    if not path.exists():
+        raise FileNotFoundError(f"{folder} holds no checkpoint: there is no {CONFIG_NAME} in it.")
+    try:
+        if json.loads(path.read_text()).get("type") != UniMASKConfig.get_choice_name(UniMASKConfig):
+            raise ValueError("it is not that of a unimask policy.")
+        return PreTrainedConfig.from_pretrained(folder)
+    except (ParsingError, ValueError, AttributeError) as error:
+        hidden = isinstance(error, ParsingError) and not isinstance(error, DecodingError)
+        reason = error.__cause__ if hidden else error
+        raise ValueError(f"{path} cannot be read: {reason}") from error
 
 
 @contextmanager

@@ -1,21 +1,29 @@
-"""Every shipped config is one that LeRobot reads, opens with the commands that use it, and fits the model."""
+"""Every shipped config is one that its command reads, opens with the commands that use it, and fits the model."""
 
 import shlex
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_unimask import UniMASKConfig
 from lerobot_unimask.cli import make_parser
+from lerobot_unimask.experiments.ablation import AblationConfig
+from lerobot_unimask.experiments.heatmap import HeatmapConfig
+from lerobot_unimask.experiments.study import read_config
+from lerobot_unimask.experiments.table import TableConfig
 from lerobot_unimask.masks import TrainingMasks, tabulate
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted(path.relative_to(ROOT) for path in ROOT.glob("configs/*.yaml"))
+TRAINING = [path for path in CONFIGS if "dataset" in yaml.safe_load((ROOT / path).read_text())]
+GRIDS = [path for path in CONFIGS if path not in TRAINING]
+GRID_OF = {"ablation": AblationConfig, "heatmap": HeatmapConfig, "table": TableConfig}
 
-pytestmark = pytest.mark.parametrize("path", CONFIGS, ids=str)
+training = pytest.mark.parametrize("path", TRAINING, ids=str)
 
 
 def opening(path: Path) -> list[str]:
@@ -35,14 +43,23 @@ def read(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> TrainPi
     return config
 
 
+@training
 def test_it_opens_with_the_commands_that_use_it(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     lines = opening(path)
     assert f"uv run lerobot-train --config_path={path}" in lines
     (build,) = (line for line in lines if line.startswith("uv run unimask build "))
     arguments = make_parser().parse_args(shlex.split(build)[3:])
-    assert arguments.root == Path(read(path, monkeypatch, tmp_path).dataset.root)
+    root = Path(read(path, monkeypatch, tmp_path).dataset.root)
+    if "uv run unimask label " in "\n".join(lines):
+        text = " ".join(line.removesuffix("\\") for line in lines[lines.index(build) + 1 :])
+        label = make_parser().parse_args(shlex.split(text.partition("uv run ")[2].partition(" uv run ")[0])[1:])
+        assert label.root == arguments.root
+        assert (label.output or label.root) == root
+    else:
+        assert arguments.root == root
 
 
+@training
 def test_lerobot_reads_it_and_knows_each_setting(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     config = read(path, monkeypatch, tmp_path)
     assert isinstance(config.policy, UniMASKConfig)
@@ -53,10 +70,23 @@ def test_lerobot_reads_it_and_knows_each_setting(path: Path, monkeypatch: pytest
     assert config.eval_steps == 0 or config.dataset.eval_split > 0
 
 
+@training
 def test_its_masks_fit_its_window(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     policy = read(path, monkeypatch, tmp_path).policy
-    factors = ("s", "a", "rtg")
+    factors = ("s", "a", "rtg", *(name.removeprefix("observation.") for name in policy.properties))
     assert TrainingMasks(policy.training_masks, factors, policy.context_length).weights
     assert tabulate(policy.inference_mask, factors, policy.context_length).t.tolist() == list(
         range(policy.context_length)
     )
+
+
+@pytest.mark.parametrize("path", GRIDS, ids=str)
+def test_a_grid_opens_with_its_command_which_reads_it(path: Path) -> None:
+    (command,) = (line for line in opening(path) if line.startswith("uv run unimask "))
+    arguments = make_parser().parse_args(shlex.split(command)[3:])
+    assert arguments.config_path == path
+    config = read_config(GRID_OF[arguments.command], ROOT / path)
+    assert config.name == path.stem
+    variants = getattr(config, "variants", {"all": {}})
+    for settings in variants.values():
+        UniMASKConfig(**{**config.policy, **settings})

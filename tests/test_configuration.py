@@ -24,6 +24,10 @@ def parse(*arguments):
         ({"context_length": 0}, "context_length is 0"),
         ({"context_length": 5000}, "context_length is 5000"),
         ({"token_layout": "heap"}, "token_layout is 'heap'; choose one of stacked, separate"),
+        ({"attention": "sideways"}, "attention is 'sideways'; choose one of both, bidirectional, causal"),
+        ({"causal_draw": "batch"}, "causal_draw is 'batch'; choose one of window, update"),
+        ({"causal_share": 1.0}, "causal_share is 1.0; it must lie between 0 and 1"),
+        ({"token_layout": "stacked"}, "token_layout=stacked needs attention=bidirectional"),
         ({"continuous_head": "mixture"}, "continuous_head is 'mixture'; choose one of l2, gaussian"),
         ({"width": 0}, "width is 0"),
         ({"depth": -1}, "depth is -1"),
@@ -175,3 +179,63 @@ def test_settings_can_be_changed_where_a_checkpoint_is_loaded(tmp_path):
         tmp_path, cli_overrides=["--training_masks=random_mask", '--given={"s[-1]": [1, 2]}', "--sample_actions=true"]
     )
     assert (changed.training_masks, changed.given, changed.sample_actions) == ("random_mask", {"s[-1]": [1, 2]}, True)
+
+
+# --- Properties ------------------------------------------------------------------------------------------------------
+
+CORNER = {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]}
+LABELLED = {
+    "observation.state": {"dtype": "float32", "shape": (2,), "names": None},
+    "action": {"dtype": "float32", "shape": (1,), "names": None},
+    "observation.visits_corner": CORNER,
+    "observation.labels.last": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
+    "observation.flag": {"dtype": "bool", "shape": (1,), "names": None},
+    "corner": CORNER,
+}
+
+
+def with_properties(*properties, features=LABELLED):
+    config = UniMASKConfig(device="cpu", properties=list(properties))
+    config.set_dataset_feature_metadata(features)
+    return config
+
+
+def test_properties_become_factors_by_the_last_part_of_their_names():
+    config = with_properties("observation.visits_corner", "observation.labels.last", "observation.flag")
+    assert list(config.features) == ["s", "a", "visits_corner", "last", "flag"]
+    assert config.features["visits_corner"] == [Feature("observation.visits_corner", 1, [2])]
+    assert config.features["last"] == [Feature("observation.labels.last", 2)]
+    assert config.features["flag"] == [Feature("observation.flag", 1, [2])]  # a truth value is one of two categories
+    assert list(with_properties().features) == ["s", "a"]  # a label is no factor unless it is named
+
+
+@pytest.mark.parametrize(
+    ("properties", "message"),
+    [
+        (
+            ["observation.corner"],
+            r"does not have; columns that could be one: observation.visits_corner, .*unimask label",
+        ),
+        (["corner"], "it is named observation.NAME"),
+        (["observation.state"], "is a factor already"),
+        (["observation.visits_corner", "observation.visits_corner"], "is a factor already"),
+    ],
+)
+def test_what_cannot_be_a_property_is_refused(properties, message):
+    with pytest.raises(ValueError, match=message):
+        with_properties(*properties)
+
+
+@pytest.mark.parametrize("name", ["s", "a", "t", "rtg"])
+def test_the_names_of_the_language_are_taken(name):
+    with pytest.raises(ValueError, match="s, a, t, rtg and other properties' names are taken"):
+        with_properties(f"observation.{name}", features={**LABELLED, f"observation.{name}": CORNER})
+
+
+def test_properties_are_saved_with_the_checkpoint(tmp_path):
+    config = with_properties("observation.visits_corner")
+    config._save_pretrained(tmp_path)
+    loaded = PreTrainedConfig.from_pretrained(tmp_path)
+    assert loaded.properties == ["observation.visits_corner"]
+    assert loaded.features == config.features
+    loaded.set_dataset_feature_metadata(LABELLED)  # fine-tuning on the same columns

@@ -24,6 +24,7 @@ from lerobot_unimask.envs.doorkey import (
     START_PAIRS,
     TASK,
     DoorKeyEnv,
+    DynamicsCheck,
     cell_at,
     coordinates,
     distance_to_goal,
@@ -447,3 +448,80 @@ def test_wrong_arguments_are_refused(tmp_path, wrong, message):
     with pytest.raises(ValueError, match=message):
         build_doorkey(tmp_path / "new", **wrong)
     assert list(tmp_path.iterdir()) == []
+
+
+# --- The dynamics as a check -----------------------------------------------------------------------------------------
+
+
+def all_episodes(first_step, K):
+    """Every (states, actions) of K steps, (M, K, 2) and (M, K - 1), from `first_step` of an episode on."""
+    agent, key = START_PAIRS.T
+    for _ in range(first_step):
+        pairs = [step(agent, key, np.array(False), action)[:2] for action in range(4)]
+        agent, key = np.unique(np.concatenate(pairs, axis=1), axis=1)
+    ways, taken = np.stack([agent, key], axis=-1)[:, None], np.zeros((len(agent), 0), dtype=int)
+    for _ in range(K - 1):
+        parts = []
+        for action in range(4):
+            nexts = step(ways[:, -1, 0], ways[:, -1, 1], np.array(False), np.array(action))[:2]
+            longer = np.concatenate([ways, np.stack(nexts, axis=-1)[:, None]], axis=1)
+            parts.append((longer, np.concatenate([taken, np.full((len(ways), 1), action)], axis=1)))
+        ways, taken = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    return ways, taken
+
+
+@pytest.mark.parametrize("first_step", [0, 2])
+def test_the_check_is_whether_some_episode_has_all_that_is_decided(first_step):
+    """Against every episode of three steps: recorded ones with some cells and actions changed, and some undecided."""
+    K, N = 3, 400
+    ways, taken = all_episodes(first_step, K)
+    rng = np.random.default_rng(first_step)
+    chosen = rng.integers(len(ways), size=N)
+    states, actions = ways[chosen].copy(), np.concatenate([taken[chosen], np.zeros((N, 1), dtype=int)], axis=1)
+    wrong = rng.random((N, K, 2)) < 0.15
+    states[wrong] = rng.integers(16, size=wrong.sum())
+    wrong = rng.random((N, K)) < 0.15
+    actions[wrong] = rng.integers(4, size=wrong.sum())
+    s, a = rng.random((N, K)) < 0.6, rng.random((N, K)) < 0.6
+    values = {
+        "s": torch.tensor(np.where(s[..., None], states, np.nan)).float(),
+        "a": torch.tensor(np.where(a, actions, np.nan)).float()[..., None],
+    }
+    decided = {"s": torch.tensor(s), "a": torch.tensor(a)}
+    agree = []
+    for n in range(N):
+        same = (ways == states[n]).all(-1) | ~s[n]
+        agree.append(bool((same.all(1) & ((taken == actions[n, :-1]) | ~a[n, :-1]).all(1)).any()))
+    check = DynamicsCheck(agree=True, first_step=first_step)(values, decided)
+    assert check.tolist() == agree
+    assert 0.2 < np.mean(agree) < 0.8
+    alone = DynamicsCheck()(values, decided)
+    assert (alone | ~check).all()  # what is part of an episode has possible steps alone
+    assert (alone & ~check).any()  # but not the other way round
+
+
+def test_the_check_judges_each_step_by_the_rules():
+    episodes = rollout(300, np.random.default_rng(0))
+    states = torch.tensor(np.stack([episodes.agent, episodes.key], axis=-1)[:, :-1]).float()
+    actions = torch.tensor(episodes.action).float()[..., None]
+    every = {"s": torch.ones(states.shape[:2], dtype=torch.bool), "a": torch.ones(states.shape[:2], dtype=torch.bool)}
+    for check in (DynamicsCheck(), DynamicsCheck(agree=True)):
+        assert check({"s": states, "a": actions}, every).all()
+        turned = (actions + 2) % 4
+        legal = step(
+            *(states[:, :-1, i].long().numpy() for i in (0, 1)), np.array(False), turned[:, :-1, 0].long().numpy()
+        )
+        same = (np.stack(legal[:2], axis=-1) == states[:, 1:].numpy()).all(axis=(1, 2))
+        assert check({"s": states, "a": turned}, every).tolist() == same.tolist()
+    nothing = {name: torch.zeros_like(known) for name, known in every.items()}
+    assert DynamicsCheck(agree=True)({"s": states * torch.nan, "a": actions * torch.nan}, nothing).all()
+
+
+def test_a_key_left_in_the_right_room_is_no_state():
+    values = {
+        "s": torch.tensor([[[5.0, 7.0]], [[7.0, 5.0]], [[7.0, 7.0]], [[5.0, 4.0]]]),
+        "a": torch.full((4, 1, 1), torch.nan),
+    }
+    decided = {"s": torch.ones(4, 1, dtype=torch.bool), "a": torch.zeros(4, 1, dtype=torch.bool)}
+    assert DynamicsCheck()(values, decided).tolist() == [False, False, True, True]
+    assert DynamicsCheck(agree=True)(values, decided).tolist() == [False, False, False, True]

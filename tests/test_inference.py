@@ -21,13 +21,13 @@ JOINT = torch.rand(36, generator=torch.Generator().manual_seed(0)).square()
 JOINT = JOINT / JOINT.sum()
 
 
-def exact_network(window, visible):
+def exact_network(window, mask, cache=None):
     """Each token's conditional distribution given the shown ones, worked out from `JOINT`."""
     B = len(window.valid)
     agrees = torch.ones(B, 36, dtype=torch.bool)
     for i, (name, step) in enumerate(TOKENS):
         same = window.values[name][:, step] == OUTCOMES[:, i]  # (B, 36)
-        agrees &= same | ~visible[name][:, step, None]
+        agrees &= same | ~mask.visible[name][:, step, None]
     weights = JOINT * agrees
     predictions = {}
     for name, count in (("s", 2), ("a", 3)):
@@ -96,9 +96,10 @@ def test_orders_are_what_they_are_called():
     def order_of(order, seed=0):
         seen = []
 
-        def spy(window, visible):
-            seen.append({(name, k) for name, shown in visible.items() for k in shown[0].nonzero().flatten().tolist()})
-            return exact_network(window, visible)
+        def spy(window, mask, cache):
+            shown = mask.visible.items()
+            seen.append({(name, k) for name, here in shown for k in here[0].nonzero().flatten().tolist()})
+            return exact_network(window, mask)
 
         drawn = draw(empty_window(1), tabulate("s[:], a[:]", ("s", "a"), K).at(None), order, seed, spy)
         seen.append(set(TOKENS))
@@ -143,6 +144,93 @@ def test_the_same_seed_draws_the_same_samples():
         assert not torch.equal(first, other)
 
 
+# --- Rejection -------------------------------------------------------------------------------------------------------
+
+
+def agreeing(values, decided):
+    """s[0] and s[1] must be equal."""
+    both = decided["s"].all(1)
+    return ~both | (values["s"][:, 0, 0] == values["s"][:, 1, 0])
+
+
+def sample_all(N, check, order="forward", seed=0, **settings):
+    mask = tabulate("s[:], a[:]", ("s", "a"), K).at(None, N)
+    generator = torch.Generator().manual_seed(seed)
+    window = empty_window(N)
+    return sample(
+        exact_network, STATISTICS, FACTORS, window, mask, order=order, generator=generator, check=check, **settings
+    )
+
+
+def test_what_contradicts_the_check_is_drawn_again():
+    """Forward, s1 alone can be rejected: P(s0, a0) stays, s1 equals s0, and a1 follows from the three."""
+    drawn = sample_all(6000, agreeing, tries=5000)
+    agrees = OUTCOMES[:, 0] == OUTCOMES[:, 2]
+    first_two = torch.zeros(36)
+    for i in range(36):
+        alike = (OUTCOMES[:, :2] == OUTCOMES[i, :2]).all(1)
+        first_two[i] = JOINT[alike].sum() * JOINT[i] / JOINT[alike & agrees].sum()
+    statistic, df = chi_square(outcome_numbers(drawn).bincount(minlength=36).float(), first_two * agrees)
+    assert statistic < df + 5 * (2 * df) ** 0.5 + 10
+    assert drawn.drawn - drawn.rejected == 4 * 6000  # none was thrown away for another reason
+    assert drawn.restarted == 0
+    assert drawn.acceptance == 1 - drawn.rejected / drawn.drawn
+    # s1 is drawn until it agrees: 1 / P(it does) times on average, which depends on s0 and a0.
+    expected = 0.0
+    for s0 in range(2):
+        for a0 in range(3):
+            alike = (OUTCOMES[:, 0] == s0) & (OUTCOMES[:, 1] == a0)
+            expected += JOINT[alike].sum() * (JOINT[alike].sum() / JOINT[alike & agrees].sum() - 1)
+    assert drawn.rejected / 6000 == pytest.approx(expected.item(), rel=0.15)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_check_that_is_always_met_changes_nothing(order):
+    checked = sample_all(200, lambda values, decided: torch.ones(len(values["s"]), dtype=torch.bool), order)
+    assert torch.equal(outcome_numbers(checked), outcome_numbers(sample_all(200, None, order)))
+    assert (checked.drawn, checked.rejected, checked.restarted, checked.acceptance) == (800, 0, 0, 1.0)
+
+
+def test_a_check_sees_what_is_decided_and_the_samples_that_have_just_drawn():
+    seen = []
+
+    def check(values, decided):
+        for name in ("s", "a"):
+            assert torch.equal(values[name][..., 0].isnan(), ~decided[name])
+        seen.append((int(decided["s"][0].sum() + decided["a"][0].sum()), len(values["s"])))
+        return torch.arange(len(values["s"])) > 0  # of each draw the first sample is rejected, if there are others
+
+    sample_all(3, lambda values, decided: check(values, decided) | (len(values["s"]) == 1) | ~decided["s"][:, 0])
+    assert seen == [(0, 3), *((count, n) for count in (1, 2, 3, 4) for n in (3, 1))]
+
+
+def test_a_dead_end_starts_the_sample_over():
+    """After a0 = 2 nothing can be drawn as s1."""
+
+    def check(values, decided):
+        return ~(decided["s"][:, 1] & (values["a"][:, 0, 0] == 2))
+
+    drawn = sample_all(500, check, tries=30)
+    assert (drawn.values["a"][:, 0] != 2).all()
+    assert not drawn.values["s"].isnan().any()
+    assert drawn.restarted > 0
+    assert drawn.rejected == 30 * drawn.restarted
+
+
+def test_it_gives_up_after_a_bound():
+    def never(values, decided):
+        return ~decided["a"][:, 1]
+
+    with pytest.raises(
+        ValueError, match=r"5 of 5 samples did not pass the check, each started 3 times; it rejected 45"
+    ):
+        sample_all(5, never, tries=3)
+    with pytest.raises(ValueError, match="what is shown is impossible already"):
+        sample_all(5, lambda values, decided: torch.zeros(5, dtype=torch.bool))
+    with pytest.raises(ValueError, match="tries is 0"):
+        sample_all(5, None, tries=0)
+
+
 # --- Answers ---------------------------------------------------------------------------------------------------------
 
 
@@ -183,7 +271,7 @@ def test_continuous_answers_are_in_the_datasets_units():
     )
     seen = {}
 
-    def network(window, visible):
+    def network(window, mask, cache):
         seen.update(window.values)
         return {"s": [torch.ones(1, 3, 2)], "a": [torch.full((1, 3, 1), -2.0)]}
 
@@ -203,7 +291,7 @@ def test_a_gaussian_head_answers_with_a_mean_and_a_scale():
     B = 4000
     output = torch.tensor([1.0, 0.5]).expand(B, 3, 2)  # mean and logarithm of the scale
 
-    def network(window, visible):
+    def network(window, mask, cache):
         return {"s": [output], "a": [output]}
 
     window = Window({name: torch.full((B, 3, 1), 7.0) for name in features}, torch.ones(B, 3).bool())

@@ -576,3 +576,105 @@ def test_moving_a_mask_keeps_it():
     moved = mask.to(torch.device("cpu"))
     assert isinstance(moved, Mask)
     assert moved.draw() == mask.draw()
+
+
+# --- Causal windows --------------------------------------------------------------------------------------------------
+
+
+def causal_masks(masks, share=1.0, B=2000, K=4, factors=("s", "a", "rtg"), **settings):
+    drawn = TrainingMasks(masks, factors, K, causal_share=share, **settings)
+    return drawn, drawn(torch.ones(B, K, dtype=torch.bool), torch.arange(B), seed=0, step=3)
+
+
+def test_a_causal_window_asks_a_question_at_every_step_at_once():
+    _, mask = causal_masks("behavior_cloning", B=1)
+    assert mask.causal.all()
+    assert mask.visible["s"].all()
+    assert mask.visible["a"][0].tolist() == [True] * 3 + [False]
+    assert mask.predict["a"].all()
+    assert not mask.predict["s"].any()
+    assert not mask.visible["rtg"].any()
+    _, mask = causal_masks("reward_conditioned", B=1)
+    assert mask.visible["rtg"][0].tolist() == [True, False, False, False]
+
+
+def test_causality_keeps_the_steps_of_a_causal_window_apart():
+    """For every t, what a causal window shows before a[t] is what the question at t shows."""
+    K, factors = 4, ("s", "a", "rtg")
+    for task in ("behavior_cloning", "reward_conditioned"):
+        _, union = causal_masks(task, B=1)
+        table = tabulate(task, factors, K)
+        for row, t in enumerate(table.t.tolist()):
+            before = {"s": t + 1, "a": t, "rtg": K}
+            for f, name in enumerate(factors):
+                assert torch.equal(union.visible[name][0, : before[name]], table.visible[row, f, : before[name]])
+                assert not table.visible[row, f, before[name] :].any()
+
+
+def test_causal_random_masking_asks_for_every_token_and_shows_half_of_the_properties():
+    _, mask = causal_masks("random_mask")
+    for name in ("s", "a"):
+        assert mask.visible[name].all()
+        assert mask.predict[name][:, 1:].all()
+    assert mask.predict["a"][:, 0].all()
+    assert not mask.predict["s"][:, 0].any()
+    assert not mask.visible["rtg"][:, 1:].any()
+    assert mask.visible["rtg"][:, 0].float().mean().item() == pytest.approx(0.5, abs=5 * 0.5 / 2000**0.5)
+
+
+def test_the_share_of_causal_windows_is_as_asked_and_the_others_are_as_without():
+    _, mask = causal_masks("multi_task", share=0.3)
+    assert mask.causal.float().mean().item() == pytest.approx(0.3, abs=5 * (0.21 / 2000) ** 0.5)
+    _, without = causal_masks("multi_task", share=0.0)
+    for name in mask.visible:
+        assert torch.equal(mask.visible[name][~mask.causal], without.visible[name][~mask.causal])
+        assert torch.equal(mask.predict[name][~mask.causal], without.predict[name][~mask.causal])
+    conditioned = mask.visible["rtg"][mask.causal][:, 0].float().mean().item()  # two of the tasks have a causal form
+    assert conditioned == pytest.approx(0.5, abs=0.11)
+
+
+def test_an_update_can_draw_its_direction_together():
+    valid, index = torch.ones(50, 4, dtype=torch.bool), torch.arange(50)
+    drawn = TrainingMasks("random_mask", ("s", "a"), 4, causal_share=0.25, causal_draw="update")
+    directions = [drawn(valid, index, seed=0, step=step).causal for step in range(400)]
+    assert all(causal.unique().numel() == 1 for causal in directions)
+    share = torch.stack(directions)[:, 0].float().mean().item()
+    assert share == pytest.approx(0.25, abs=5 * (0.1875 / 400) ** 0.5)
+
+
+def test_without_a_causal_form_nothing_is_causal_or_the_mask_is_refused():
+    _, mask = causal_masks("past", share=0.5)
+    assert mask.causal is False
+    with pytest.raises(MaskError, match="trained on questions that ask for one token"):
+        causal_masks(["behavior_cloning", "future"], share=1.0)
+
+
+@pytest.mark.parametrize(
+    ("masks", "text", "t", "causally"),
+    [
+        ("random_mask", "behavior_cloning", 2, {"a": [2], "s": []}),
+        ("random_mask", "reward_conditioned", 0, {"a": [0], "s": []}),
+        ("random_mask", "future", 1, {"a": [1], "s": []}),  # the rest of the future is not the next token
+        ("random_mask", "s[3] | s[:3], a[:3]", None, {"s": [3], "a": []}),
+        ("random_mask", "goal_conditioned", 2, {"a": [], "s": []}),
+        ("random_mask", "past", 2, {"a": [], "s": []}),
+        ("random_mask", "forward_dynamics", 1, {"a": [], "s": []}),
+        ("random_mask", "s[0]", None, {"a": [], "s": []}),  # nothing comes before it
+        ("behavior_cloning", "behavior_cloning", 2, {"a": [2], "s": []}),
+        ("behavior_cloning", "reward_conditioned", 2, {"a": [], "s": []}),  # it has not learnt that
+        ("behavior_cloning", "s[3] | s[:3], a[:3]", None, {"a": [], "s": []}),
+        ("past", "behavior_cloning", 2, {"a": [], "s": []}),
+    ],
+)
+def test_what_is_answered_causally(masks, text, t, causally):
+    drawn, _ = causal_masks(masks, share=0.5)
+    mask = tabulate(text, drawn.factors, 4).at(t, 3)
+    for name, tokens in drawn.answered_causally(mask).items():
+        assert tokens.shape == (3, 4)
+        assert all(row.nonzero().flatten().tolist() == causally[name] for row in tokens)
+
+
+def test_nothing_is_answered_causally_by_a_bidirectional_model():
+    drawn, _ = causal_masks("random_mask", share=0.0)
+    mask = tabulate("behavior_cloning", drawn.factors, 4).at(2)
+    assert not any(tokens.any() for tokens in drawn.answered_causally(mask).values())

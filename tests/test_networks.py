@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lerobot_unimask.losses import masked_losses
-from lerobot_unimask.networks.transformer import NumberEncoding, Transformer
+from lerobot_unimask.networks.transformer import Cache, NumberEncoding, Transformer, course
 from lerobot_unimask.window import Feature, Window, make_factors
 
 B, K = 3, 5
@@ -192,6 +192,42 @@ def test_number_encodings_are_those_of_a_loop_over_tokens():
     assert torch.equal(plain(value, visible), value)
 
 
+def slow_course(value, shown, k, causal):
+    """Of one step of one window, by cases."""
+    steps = shown.nonzero().flatten().tolist()
+    before, after = [i for i in steps if i < k], [] if causal else [i for i in steps if i > k]
+    if before and after:
+        i, j = before[-1], after[0]
+        return value[i] + (value[j] - value[i]) * (k - i) / (j - i)
+    near = before[::-1] or after
+    if len(near) > 1:
+        i, j = near[:2]
+        return value[i] + (value[i] - value[j]) / (i - j) * (k - i)
+    return value[near[0]] if near else torch.zeros(2)
+
+
+def test_the_course_of_states_is_that_of_a_loop_over_tokens():
+    generator = torch.Generator().manual_seed(0)
+    shown = torch.rand(300, K, generator=generator) < torch.rand(300, 1, generator=generator)
+    value = torch.where(shown.unsqueeze(-1), torch.randn(300, K, 2, generator=generator), 0.0)
+    causal = torch.rand(300, generator=generator) < 0.5
+    expected = [[slow_course(value[b], shown[b], k, causal[b]) for k in range(K)] for b in range(300)]
+    expected = torch.stack([torch.stack(row) for row in expected])
+    torch.testing.assert_close(course(value, shown, causal), expected)
+    torch.testing.assert_close(course(value, shown, True)[causal], expected[causal])
+    torch.testing.assert_close(course(value, shown, False)[~causal], expected[~causal])
+
+
+def test_states_that_go_straight_on_are_predicted_before_anything_is_learnt():
+    """An untrained network is off by what its weights happen to say, which does not grow with the distance."""
+    network, factors = make_network("continuous", "separate")
+    for parameter in network.heads["s"].parameters():
+        torch.nn.init.zeros_(parameter)
+    values = random_window(factors).values | {"s": 3 + torch.arange(K).view(1, K, 1) * torch.randn(B, 1, 3)}
+    visible = {name: (torch.arange(K) < 2).expand(B, K) for name in factors}
+    torch.testing.assert_close(network(Window(values, torch.ones(B, K).bool()), visible)["s"][0], values["s"])
+
+
 def test_the_network_learns_what_a_mask_hides():
     """Forward dynamics of a ring, s[k + 1] = (s[k] + 1) mod 7, from one shown state: model and loss together."""
     torch.manual_seed(0)
@@ -220,3 +256,86 @@ def test_the_network_learns_what_a_mask_hides():
         optimiser.step()
     assert loss < 0.05  # chance is ln 7 = 1.95
     assert torch.equal(network(window, visible)["s"][0].argmax(-1)[:, 1:], states[:, 1:, 0].long())
+
+
+# --- Causal attention ------------------------------------------------------------------------------------------------
+
+
+def in_order(factors):
+    """The tokens in the order in which a causal network reads them."""
+    return [(name, 0) for name in factors if name not in ("s", "a")] + [(n, k) for k in range(K) for n in ("s", "a")]
+
+
+def test_a_causal_prediction_sees_the_tokens_before_it_and_no_others(kind):
+    network, factors = make_network(kind, "separate")
+    window, visible = random_window(factors), random_visible(factors)
+    visible = {name: shown.index_fill(1, torch.tensor(0), True) for name, shown in visible.items()}
+    order = in_order(factors)
+    reference = network(window, visible, True)
+    for place, (changed, step) in enumerate(order):
+        shown = visible[changed][:, step]
+        values = {name: value.clone() for name, value in window.values.items()}
+        # Another category, or another number
+        values[changed][:, step] = torch.where(values[changed][:, step] == 0, 1.0, 0.0)
+        moved = network(Window(values, window.valid), visible, True)
+        for later, (name, at) in enumerate(order):
+            if name not in moved:
+                continue
+            same = torch.stack(
+                [(x[:, at] == y[:, at]).all(1) for x, y in zip(moved[name], reference[name], strict=True)]
+            ).all(0)
+            if later <= place:
+                assert same.all(), (changed, step, name, at)
+            else:
+                assert torch.equal(same, ~shown), (changed, step, name, at)
+
+
+def test_a_causal_prediction_does_not_depend_on_whether_its_own_token_is_shown(kind):
+    network, factors = make_network(kind, "separate")
+    window, visible = random_window(factors), random_visible(factors)
+    other = {name: shown.clone() for name, shown in visible.items()}
+    other["a"][:, -1] = ~other["a"][:, -1]
+    for x, y in zip(network(window, visible, True)["a"], network(window, other, True)["a"], strict=True):
+        assert torch.equal(x, y)
+
+
+def test_each_window_is_read_in_its_own_direction(kind):
+    network, factors = make_network(kind, "separate")
+    window, visible = random_window(factors), random_visible(factors)
+    causal = torch.tensor([True, False, True])
+    mixed, forwards, both = (flat(network(window, visible, direction)) for direction in (causal, True, False))
+    torch.testing.assert_close(mixed, torch.where(causal[:, None], forwards, both))
+
+
+def test_a_rollouts_cache_changes_no_prediction_and_computes_each_token_once(kind):
+    network, factors = make_network(kind, "separate")
+    window = random_window(factors)
+    counted = []
+    network.blocks[0].register_forward_hook(lambda _, inputs, __: counted.append(inputs[0].shape[1]))
+    cache = Cache()
+    properties = len(factors) - 2
+    for step in range(K):
+        visible = {name: torch.zeros(B, K, dtype=torch.bool) for name in factors}
+        for name in factors:
+            visible[name][:, : {"s": step + 1, "a": step}.get(name, 1)] = True
+        with torch.no_grad():
+            kept, anew = (network(window, visible, True, c)["a"] for c in (cache, None))
+        for x, y in zip(kept, anew, strict=True):
+            torch.testing.assert_close(x[:, step], y[:, step])
+    assert counted[::2] == [properties + 1] + [2] * (K - 1)
+    # Another history, another question or other environments: what was kept is not used.
+    visible["a"][0, 0] = False
+    with torch.no_grad():
+        kept, anew = (network(window, visible, True, c)["a"] for c in (cache, None))
+    for x, y in zip(kept, anew, strict=True):
+        torch.testing.assert_close(x[:, K - 1], y[:, K - 1])
+    assert counted[-2] == properties + 2 * K - 1
+
+
+def test_mixed_precision_answers_in_full_precision(kind):
+    network, factors = make_network(kind, "separate")
+    window, visible = random_window(factors), random_visible(factors)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = flat(network(window, visible))
+    assert mixed.dtype == torch.float32
+    torch.testing.assert_close(mixed, flat(network(window, visible)), rtol=0.1, atol=0.05)

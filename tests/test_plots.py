@@ -11,9 +11,11 @@ from matplotlib.patches import Rectangle
 
 from dataset_builders.doorkey import FEATURES, rollout
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy, plots
-from lerobot_unimask.envs.doorkey import GOAL, HORIZON
+from lerobot_unimask.envs.doorkey import GOAL, HORIZON, coordinates
+from lerobot_unimask.envs.maze2d import MAZES
 from lerobot_unimask.experiments import gridworld
 from lerobot_unimask.masks import tabulate
+from lerobot_unimask.window import Window
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +99,8 @@ def test_trajectories_stay_in_their_cells():
     panel = expert_panel()
     points = np.concatenate([panel.states] * 3)  # three trajectories that share every cell
     axes = Figure().subplots()
-    plots._draw_trajectories(axes, points, plots._time(HORIZON))
-    cells = plots.coordinates(points[..., 0])
+    plots.grid._draw_trajectories(axes, points, plots.style.time_colours(HORIZON))
+    cells = coordinates(points[..., 0])
     ways = axes.collections
     lines = [way for way in ways if hasattr(way, "get_segments")]
     assert len(lines) == 3
@@ -147,3 +149,121 @@ def test_a_mask_diagram_marks_every_token():
 def test_a_long_window_keeps_the_figure_s_width():
     mask = tabulate("behavior_cloning", ("s", "a"), 200).at(100)
     assert plots.mask_diagram(mask).get_size_inches()[0] == plots.WIDTH
+
+
+# --- Samples, marginals and mazes ------------------------------------------------------------------------------------
+
+
+def expert_states(episodes):
+    played = rollout(episodes, np.random.default_rng(1))
+    return np.stack([played.agent, played.key], axis=-1)[:, :HORIZON]
+
+
+def test_trajectories_have_a_grid_for_each_group(tmp_path):
+    states = expert_states(40)
+    figure = plots.trajectories({"one": states[:20], "two": states[20:]}, captions=["a", "b"], cell=0, most=15)
+    figure.savefig(tmp_path / "ways.png")
+    one, two, colorbar = figure.axes
+    assert [axes.get_title() for axes in (one, two)] == ["one", "two"]
+    assert [axes.get_xlabel() for axes in (one, two)] == ["a", "b"]
+    assert colorbar.get_ylabel() == "step"
+    for axes, drawn in ((one, states[:15]), (two, states[20:35])):
+        lines = [way for way in axes.collections if hasattr(way, "get_segments")]
+        assert len(lines) == 15
+        for line, way in zip(lines, drawn, strict=True):
+            points = np.array([segment[0] for segment in line.get_segments()])
+            cells = np.stack(coordinates(way[:-1, 0]), axis=-1)
+            assert (np.abs(points - cells) < 0.5).all()  # the jitter leaves no cell
+    assert legend_of(figure)[-1] == "the cell in question"
+    assert "the cell in question" not in legend_of(plots.trajectories({"one": states}))
+
+
+def test_marginals_show_every_component_that_is_asked(policy, tmp_path):
+    states = torch.tensor(expert_states(1)).float()
+    window = Window(
+        {"s": states, "a": torch.zeros(1, HORIZON, 1), "rtg": torch.zeros(1, HORIZON, 2)},
+        torch.ones(1, HORIZON, dtype=torch.bool),
+    )
+    answer = policy.infer(window, "s[1:8], a[:3] | s[0]")
+    figure = plots.marginals(answer, window)
+    figure.savefig(tmp_path / "marginals.png")
+    *rows, colorbar = figure.axes
+    assert [axes.get_ylabel() for axes in rows] == ["s: agent_cell", "s: key_cell", "a: direction"]
+    assert rows[-1].get_xlabel() == "step"
+    assert colorbar.get_ylabel() == "probability"
+    agent = answer["s"][0].probabilities[0].T.numpy()
+    np.testing.assert_array_equal(np.ma.filled(rows[0].images[0].get_array(), np.nan), agent)
+    truth = rows[0].collections[0].get_offsets()
+    np.testing.assert_array_equal(truth, [[step, states[0, step, 0]] for step in range(1, 8)])
+    assert legend_of(figure) == ["shown", "recorded"]
+    assert legend_of(plots.marginals(answer)) == ["shown"]
+    assert len(plots.marginals(policy.infer(window, "a[0] | s[0]")).axes) == 2  # states are not asked
+
+
+@pytest.mark.parametrize("kind", ["continuous", "gaussian"])
+def test_marginals_of_numbers_are_lines(kind, tiny_policy, continuous_batch):
+    policy = tiny_policy(kind)
+    window = policy.make_window(continuous_batch)
+    answer = policy.infer(window, "s[1:8] | s[0]")
+    (axes,) = plots.marginals(answer, window, window=2).axes
+    assert [line.get_ydata()[4] for line in axes.lines] == pytest.approx(answer["s"][0].mean[2, 4].tolist())
+    bands = [band for band in axes.collections if type(band).__name__ == "FillBetweenPolyCollection"]
+    assert len(bands) == (3 if kind == "gaussian" else 0)
+
+
+def test_distributions_are_shares_of_each_group(policy, tiny_policy, continuous_batch):
+    states = torch.tensor(expert_states(30)).float()
+    valid = torch.ones(30, HORIZON, dtype=torch.bool)
+    valid[:, 8:] = False
+    actions = torch.randint(4, (30, HORIZON, 1)).float()
+    actions[:, 3] = torch.nan
+    recorded = Window({"s": states, "a": actions}, valid)
+    shifted = Window({"s": 15 - states, "a": actions}, valid)
+    figure = plots.distributions({"recorded": recorded, "shifted": shifted}, policy.factors)
+    agent, key, direction = figure.axes
+    assert [axes.get_xlabel() for axes in (agent, key, direction)] == ["s: agent_cell", "s: key_cell", "a: direction"]
+    assert legend_of(figure) == ["recorded", "shifted"]
+    share = np.bincount(states[:, :8, 1].flatten().long(), minlength=16) / 240
+    heights = np.array([bar.get_height() for bar in key.patches]).reshape(2, 16)
+    np.testing.assert_allclose(heights, [share, share[::-1]])
+    assert sum(bar.get_height() for bar in direction.patches) == pytest.approx(2)
+    continuous = tiny_policy("continuous")
+    window = continuous.make_window(continuous_batch)
+    labels = [axes.get_xlabel() for axes in plots.distributions({"all": window}, continuous.factors).axes]
+    assert labels[:5] == ["s: state[0]", "s: state[1]", "s: state[2]", "a: action[0]", "a: action[1]"]
+    nothing = Window({name: values * torch.nan for name, values in window.values.items()}, window.valid)
+    with pytest.raises(ValueError, match="nothing to draw"):
+        plots.distributions({"all": window, "none": nothing}, continuous.factors)
+
+
+MAZE = {
+    "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
+    "action": {"dtype": "float32", "shape": (2,), "names": None},
+}
+MAZE_STATS = {
+    "observation.state": {"mean": [3.0] * 4, "std": [1.0] * 4},
+    "action": {"mean": [0.0] * 2, "std": [1.0] * 2},
+}
+
+
+@pytest.mark.parametrize("kind", ["continuous", "gaussian"])
+def test_maze_trajectories_stand_over_the_walls(kind, tiny_policy, tmp_path):
+    policy = tiny_policy(kind, features=MAZE, stats=MAZE_STATS)
+    states = torch.tensor([[4.8 - 0.05 * step, 0.8, 3.0, 2.0] for step in range(10)])[None]
+    window = Window({"s": states, "a": torch.zeros(1, 10, 2)}, torch.ones(1, 10, dtype=torch.bool))
+    answer = policy.infer(window, "s[:] | s[0], s[5]")
+    figure = plots.maze_trajectories(answer, window)
+    figure.savefig(tmp_path / "maze.png")
+    whole, close = figure.axes
+    for axes in (whole, close):
+        ellipses = [patch for patch in axes.patches if type(patch).__name__ == "Ellipse"]
+        assert len(ellipses) == (8 if kind == "gaussian" else 0)  # none where shown
+        drawn = np.stack(axes.lines[1].get_data(), axis=1)
+        np.testing.assert_allclose(drawn, answer["s"][0].mean[0, :, :2].numpy(), rtol=1e-6)
+    if kind == "gaussian":
+        ellipse, scale = ellipses[0], answer["s"][0].scale[0, 1]
+        assert (ellipse.width, ellipse.height) == pytest.approx((4 * scale[0].item(), 4 * scale[1].item()))
+    assert ("two scales around it" in legend_of(figure)) == (kind == "gaussian")
+    walls = [patch for patch in whole.patches if patch.get_facecolor() == to_rgba(plots.WALL)]
+    assert min(patch.get_center()[0] for patch in walls) == pytest.approx(-0.2)  # D4RL's quirk, see envs/maze2d.py
+    assert len(walls) == MAZES["medium"].count("#")

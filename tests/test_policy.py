@@ -18,7 +18,11 @@ from lerobot_unimask.inference import ORDERS
 from lerobot_unimask.masks import TrainingMasks, mixture
 
 KINDS = ("doorkey", "continuous", "gaussian")
-LAYOUTS = ("stacked", "separate")
+LAYOUTS = {
+    "stacked": {"token_layout": "stacked", "attention": "bidirectional"},
+    "separate": {"attention": "bidirectional"},
+    "both": {"attention": "both"},
+}
 
 
 @pytest.fixture(params=KINDS)
@@ -316,7 +320,7 @@ def random_question(policy, batch, seed):
 
 
 def test_answers_are_distributions_shown_values_come_back_and_hidden_ones_are_nan(kind, layout, tiny_policy, batch_of):
-    policy = tiny_policy(kind, token_layout=layout)
+    policy = tiny_policy(kind, **LAYOUTS[layout])
     for seed in range(10):
         window, mask = random_question(policy, batch_of(kind), seed)
         answer = policy.infer(window, mask)
@@ -342,7 +346,7 @@ def test_answers_are_distributions_shown_values_come_back_and_hidden_ones_are_na
 
 
 def test_a_token_asked_alone_or_among_others_has_the_same_marginal(kind, layout, tiny_policy, batch_of):
-    policy, batch = tiny_policy(kind, token_layout=layout), batch_of(kind)
+    policy, batch = tiny_policy(kind, **LAYOUTS[layout]), batch_of(kind)
     together = policy.infer(batch, "s[1:], a[:] | s[0]")
     for step in range(10):
         alone = policy.infer(batch, f"a[{step}] | s[0]")
@@ -355,7 +359,7 @@ def test_a_token_asked_alone_or_among_others_has_the_same_marginal(kind, layout,
 
 @pytest.mark.parametrize("task", TASKS)
 def test_hidden_values_and_the_future_change_no_answer(kind, layout, tiny_policy, batch_of, task):
-    policy = tiny_policy(kind, token_layout=layout)
+    policy = tiny_policy(kind, **LAYOUTS[layout])
     window = policy.make_window(batch_of(kind))
     answer = policy.infer(window, task, t=4)
     values = {
@@ -451,7 +455,7 @@ def test_asking_builds_no_graph_and_moves_no_global_generator(tiny_policy, doork
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_samples_keep_what_is_shown_and_fill_what_is_asked(kind, layout, order, tiny_policy, batch_of):
-    policy = tiny_policy(kind, token_layout=layout)
+    policy = tiny_policy(kind, **LAYOUTS[layout])
     window, mask = random_question(policy, batch_of(kind), seed=2)
     before = copy.deepcopy(window)
     drawn = policy.sample(window, mask, order=order, seed=4)
@@ -541,7 +545,7 @@ def test_acting_is_a_question_asked_at_every_step(kind, layout, question, K, tin
     place = [[3.0, 4.0 + b] for b in range(B)] if kind == "doorkey" else [[90.0 + b, -5.0, 0.5] for b in range(B)]
     given = {f"s[{min(waypoint, K - 1)}]": place} if question == "waypoint" else {}
     settings = {"target_return": target} if question == "return" else {}
-    policy = tiny_policy(kind, context_length=K, token_layout=layout, inference_mask=mask, given=given, **settings)
+    policy = tiny_policy(kind, context_length=K, **LAYOUTS[layout], inference_mask=mask, given=given, **settings)
     episode = Episode(kind, B, T)
     for step in range(T):
         torch.manual_seed(step)
@@ -739,7 +743,7 @@ def test_the_target_shrinks_by_what_was_received_before_the_window(tiny_policy):
 
 
 def test_a_loaded_policy_gives_the_same_answers(kind, layout, tiny_policy, batch_of, tmp_path, states):
-    policy, batch = tiny_policy(kind, token_layout=layout, training_masks=["multi_task", "random_mask"]), batch_of(kind)
+    policy, batch = tiny_policy(kind, **LAYOUTS[layout], training_masks=["multi_task", "random_mask"]), batch_of(kind)
     for _ in range(5):
         policy.update()
     policy.save_pretrained(tmp_path)
@@ -1063,3 +1067,98 @@ def test_a_one_number_state_comes_with_or_without_its_axis(state):
         {key: {"dtype": "float32", "shape": (1,), "names": None} for key in ("observation.state", "action")}
     )
     assert UniMASKPolicy(config).select_action({"observation.state": state}).shape == (2, 1)
+
+
+# --- Attention -------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_that_attends_causally_alone_refuses_what_it_has_not_learnt(tiny_policy, doorkey_batch):
+    policy = tiny_policy(attention="causal", training_masks=["behavior_cloning", "reward_conditioned"])
+    answer = policy.infer(doorkey_batch, "reward_conditioned", t=3)["a"][0].probabilities[:, 3]
+    assert torch.equal(answer.isfinite().all(1), policy.make_window(doorkey_batch).valid[:, 3])
+    with pytest.raises(MaskError, match=r"attends causally alone\. It was trained on behavior_cloning, reward_conditi"):
+        policy.infer(doorkey_batch, "goal_conditioned", t=3)
+    with pytest.raises(MaskError, match="trained on questions that ask for one token"):
+        tiny_policy(attention="causal", training_masks="past")
+
+
+def test_both_directions_train_the_same_weights_and_answer_with_them(tiny_policy, doorkey_batch):
+    """The next action of a full history comes from the causal reading, everything else from the other."""
+    policy = tiny_policy(attention="both")
+    window = policy.make_window(doorkey_batch)
+    full = window.valid.all(1)
+    window = Window({name: value[full] for name, value in window.values.items()}, window.valid[full])
+    normalised = policy.statistics.normalise(window)
+    for task, causal in (("behavior_cloning", True), ("goal_conditioned", False)):
+        mask = policy._table(task).at(3, len(window.valid))
+        logits = policy.network(normalised, mask.visible, causal)["a"][0][:, 3]
+        answer = policy.infer(window, task, t=3)["a"][0].probabilities[:, 3]
+        torch.testing.assert_close(answer, logits.softmax(-1))
+
+
+# --- Properties and given tokens in rollouts -------------------------------------------------------------------------
+
+WITH_CORNER = {
+    **CONTINUOUS_FEATURES,
+    "observation.corner": {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]},
+}
+
+
+def test_a_property_is_read_from_the_batch_and_never_predicted(tiny_policy, continuous_batch):
+    policy = tiny_policy("continuous", features=WITH_CORNER, properties=["observation.corner"])
+    corner = torch.tensor([0, 1, 0, 1, 1])
+    batch = continuous_batch | {"observation.corner": corner[:, None].expand(-1, 10)}
+    assert list(policy.factors) == ["s", "a", "rtg", "corner"]
+    assert torch.equal(policy.make_window(batch).values["corner"][:, 0, 0], corner.float())
+    loss, parts = policy.train().forward(batch)
+    loss.backward()
+    assert parts.keys() == {"loss_s", "loss_a"}
+    policy.eval()
+    asked = policy.infer(batch, "a[1] | s[0], corner[0]").most_likely("a")[:, 1]
+    turned = policy.infer(batch, "a[1] | s[0], corner[0]", given={"corner[0]": (1 - corner)[:, None]})
+    assert not torch.allclose(asked, turned.most_likely("a")[:, 1])
+    with pytest.raises(MaskError, match="can be shown but never asked"):
+        policy.infer(batch, "corner[0] | s[0]")
+
+
+@pytest.mark.parametrize("K", [3, 10])
+def test_a_property_holds_for_the_whole_rollout(K, tiny_policy, states):
+    """Also once the window slides: it stays at the window's first position, from the config as from the call."""
+    mask = "a[t] | s[:t+1], a[:t], corner[0]"
+    settings = {"features": WITH_CORNER, "properties": ["observation.corner"], "context_length": K}
+    policy = tiny_policy("continuous", **settings)
+    asked, not_asked = (roll(policy, states, mask=mask, given={"corner[0]": corner}) for corner in (1, 0))
+    assert all(not torch.allclose(*pair) for pair in zip(asked, not_asked, strict=True))
+    by_config = tiny_policy("continuous", inference_mask=mask, given={"corner[0]": 1}, **settings)
+    assert torch.equal(roll(by_config, states), asked)
+
+
+def test_a_given_token_of_a_short_window_expires_for_good(tiny_policy, states):
+    """Positions are the episode's steps until the window is full; then all is observed and nothing given counts."""
+    policy = tiny_policy("continuous", context_length=3)
+    mask = "a[t] | s[:t+1], a[:t], s[-1]"
+    goals = ([150.0, -5.0, 0.5], [50.0, -4.0, 0.5])
+    first, second = [], []
+    for actions, goal in ((first, goals[0]), (second, goals[1])):
+        policy.reset()
+        for step, state in enumerate(states):
+            actions.append(policy.select_action({"observation.state": state}, mask=mask, given={"s[-1]": goal}))
+            policy._memory.values["a"][:, policy._memory.position] = float(step)  # the same past for both
+            policy._memory.cache = type(policy._memory.cache)()
+    same = [torch.equal(*pair) for pair in zip(first, second, strict=True)]
+    assert same == [False, False, True, True, True, True]
+
+
+def test_a_question_changed_in_the_settings_takes_effect_at_the_next_step(tiny_policy, states):
+    policy = tiny_policy("continuous")
+    goal = {"s[-1]": [150.0, -5.0, 0.5]}
+    by_call = []
+    policy.reset()
+    for step, state in enumerate(states):
+        how = {"mask": "goal_conditioned", "given": goal} if step >= 3 else {}
+        by_call.append(policy.select_action({"observation.state": state}, **how))
+    policy.reset()
+    for step, state in enumerate(states):
+        if step == 3:
+            policy.config.inference_mask, policy.config.given = "goal_conditioned", goal
+        assert torch.equal(policy.select_action({"observation.state": state}), by_call[step])

@@ -60,10 +60,17 @@ def test_a_missing_dataset_is_not_sought_on_the_hub(tiny_policy, tmp_path) -> No
 # --- The losses ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("layout", ["stacked", "separate"])
-def test_a_loss_is_the_mean_surprise_at_the_asked_for_tokens(tiny_policy, batch, layout) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"token_layout": "stacked", "attention": "bidirectional"},
+        {"token_layout": "separate", "attention": "bidirectional"},
+        {"attention": "both"},
+    ],
+)
+def test_a_loss_is_the_mean_surprise_at_the_asked_for_tokens(tiny_policy, batch, settings) -> None:
     """Window by window and token by token, through `infer`, which shares neither batching nor the loss."""
-    policy = scaled(tiny_policy(token_layout=layout), 3.0)  # far from uniform
+    policy = scaled(tiny_policy(**settings), 3.0)  # far from uniform
     losses = task_losses(policy, batch, ALL)
     truth = {"s": batch["observation.state"], "a": batch["action"].reshape(EPISODES, -1, 1)}
     for text in ALL:
@@ -84,9 +91,15 @@ def test_a_loss_is_the_mean_surprise_at_the_asked_for_tokens(tiny_policy, batch,
 
 def test_every_policy_gets_the_same_windows_and_masks(tiny_policy, batch) -> None:
     def asked_of(policy: UniMASKPolicy, masks) -> dict[str, list]:
-        """mask text -> all values and all visible tokens that the network was given."""
+        """mask text -> all values and all visible tokens that the policy was given."""
         given = []
-        policy.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
+        predict = policy.predict
+
+        def record(window, mask):
+            given.append((window, mask.visible))
+            return predict(window, mask)
+
+        policy.predict = record
         task_losses(policy, batch, masks)
         return dict(zip(masks, given, strict=True))
 
@@ -186,6 +199,33 @@ def test_the_record_is_complete_and_names_no_place_on_this_machine(runs, tmp_pat
         assert training["data"] == record["validation_data"]
         assert training["policy"]["training_masks"] == "random_mask"
         assert {"width", "depth", "heads", "dropout", "optimizer_lr", "loss_weights"} <= training["policy"].keys()
+
+
+def test_the_optimum_stands_beside_the_runs(runs) -> None:
+    """The exact losses are below the models', and a model's loss exceeds the expected optimum by its divergence."""
+    folders, data = runs
+    record = validate(folders, data, "local/doorkey", "paper")
+    json.dumps(record, allow_nan=False)
+    optimum = record["optimum"]
+    assert optimum["expert"] == "paper"
+    assert optimum["losses"].keys() == optimum["expected_losses"].keys() == set(ALL)
+    assert optimum["losses"]["forward_dynamics"] == pytest.approx(0, abs=1e-9)
+    for result in record["runs"]:
+        for task in ALL:
+            assert result["divergence"][task] > 0
+            assert result["above_optimum"][task] == result["losses"][task] - optimum["losses"][task] > 0
+        for kind in ("agent_cell", "key_cell", "direction"):
+            assert result["random_mask_divergence"][kind]["all"] > 0
+    with pytest.raises(ValueError, match="expert 'paper': its optimum is not 'released'"):
+        validate(folders, data, "local/doorkey", "released")
+
+
+def test_a_model_that_answers_some_tasks_alone_is_validated_on_those(tiny_policy, doorkey_root, tmp_path) -> None:
+    causal = {"attention": "causal", "token_layout": "separate"}
+    tiny_policy(training_masks="behavior_cloning", **causal).save_pretrained(tmp_path)
+    (result,) = validate([tmp_path], doorkey_root, "local/doorkey", "paper")["runs"]
+    assert result["losses"].keys() == result["divergence"].keys() == {"behavior_cloning"}
+    assert "random_mask_divergence" not in result
 
 
 def test_one_checkpoint_can_be_validated_by_itself(runs) -> None:

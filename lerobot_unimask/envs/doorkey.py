@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
+import torch
 from minigrid.core.actions import Actions
 from minigrid.core.grid import Grid
 from minigrid.core.mission import MissionSpace
@@ -144,6 +145,62 @@ def expert_progress(
     target_x, target_y = coordinates(np.where(door_open, GOAL, np.where(agent == key, DOOR, key)))
     distance = np.abs(x - target_x) + np.abs(y - target_y)
     return distance - np.abs(tried_x - target_x) - np.abs(tried_y - target_y)
+
+
+# --- A check for samples ----------------------------------------------------------------------------------------------
+
+
+class DynamicsCheck:
+    """Whether states and actions can follow each other by the rules: a check for `policy.sample`.
+
+    The door is not in the state, nor is it needed: without the key it is closed, for a key once taken is carried on,
+    and with the key it opens. So there are 69 states, those 56 in which an episode may start and 13 with the key.
+
+    Args:
+        agree: insist, too, that all decided tokens agree, however far apart: that one whole episode has them all. This
+            is the rejection that the paper leaves undone, of what contradicts a state shown elsewhere. Without it each
+            step is judged alone, from what is decided of its two states and its action.
+        first_step: the episode's step at which the windows start; `agree` knows which states it can have.
+    """
+
+    def __init__(self, *, agree: bool = False, first_step: int = 0):
+        self.agree = agree
+        with_key = [(cell, cell) for cell in CELLS[~((coordinates(CELLS)[0] == _WALL_X) & (CELLS != DOOR))]]
+        agent, key = np.concatenate([START_PAIRS, with_key]).T  # (69,)
+        self._number = np.full((len(CELLS), len(CELLS)), -1)  # of the state with these cells; -1: there is none
+        self._number[agent, key] = np.arange(len(agent))
+        following = step(agent[:, None], key[:, None], np.array(False), np.arange(len(ACTIONS)))
+        self._following = self._number[following[0], following[1]]  # (69, 4)
+        self._first = np.arange(len(agent)) < len(START_PAIRS)  # (69,) the states at the windows' first step
+        for _ in range(first_step):
+            self._first = self._image(self._first[None], np.ones((1, len(ACTIONS)), dtype=bool))[0]
+
+    def __call__(self, values: dict[str, torch.Tensor], decided: dict[str, torch.Tensor]) -> torch.Tensor:
+        """(N,) bool, from `s` (N, K, 2) and `a` (N, K, 1), and which of them are decided, (N, K) each."""
+        cells = values["s"].nan_to_num(0).long().numpy(force=True)
+        states = _possible(self._number[cells[..., 0], cells[..., 1]], decided["s"], len(self._following))  # (N, K, 69)
+        taken = values["a"][..., 0].nan_to_num(0).long().numpy(force=True)
+        actions = _possible(taken, decided["a"], len(ACTIONS))  # (N, K, 4)
+        before = states[:, 0] & self._first if self.agree else states[:, 0]
+        fine = before.any(axis=1) & states.any(axis=-1).all(axis=1)  # (N,)
+        for k in range(states.shape[1] - 1):
+            after = self._image(before, actions[:, k]) & states[:, k + 1]
+            fine &= after.any(axis=1)
+            before = after if self.agree else states[:, k + 1]
+        return torch.from_numpy(fine).to(values["s"].device)
+
+    def _image(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The states (N, 69) that some of these states, (N, 69), lead to by some of these actions, (N, 4)."""
+        image = np.zeros(states.shape, dtype=bool)
+        for action, following in enumerate(self._following.T):
+            n, state = (states & actions[:, action, None]).nonzero()
+            image[n, following[state]] = True
+        return image
+
+
+def _possible(number: np.ndarray, decided: torch.Tensor, count: int) -> np.ndarray:
+    """(N, K) -> (N, K, count) bool: the one number where decided, all of them elsewhere."""
+    return (number[..., None] == np.arange(count)) | ~decided.numpy(force=True)[..., None]
 
 
 # --- The environment, on MiniGrid's objects ---------------------------------------------------------------------------

@@ -19,8 +19,13 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_unimask.experiments.validation import checkpoints_of, training_settings
 
 
-def rollouts(checkpoint: Path, env_type: str, episodes: int, *, batch_size: int, seed: int) -> dict[str, Any]:
+def rollouts(
+    checkpoint: Path, env_type: str, episodes: int, *, batch_size: int, seed: int, **settings: Any
+) -> dict[str, Any]:
     """What lerobot-eval does with one checkpoint, videos apart.
+
+    Args:
+        settings: of the policy, in place of the checkpoint's, as `--policy.NAME=...`.
 
     Returns:
         mean return, its standard error, the share of successes, and the seconds that it took.
@@ -28,6 +33,8 @@ def rollouts(checkpoint: Path, env_type: str, episodes: int, *, batch_size: int,
     set_seed(seed)
     config = PreTrainedConfig.from_pretrained(checkpoint)
     config.pretrained_path = checkpoint
+    for name, value in settings.items():
+        setattr(config, name, value)
     env_config = make_env_config(env_type)
     envs = make_env(env_config, n_envs=batch_size)
     policy = make_policy(config, env_cfg=env_config)

@@ -1,0 +1,39 @@
+"""The networks: (window, visible) -> predictions, one file each, chosen by `--policy.network=...`."""
+
+from typing import TYPE_CHECKING
+
+from torch import nn
+
+from lerobot_unimask.networks.decision_gpt import DecisionGPT
+from lerobot_unimask.networks.decision_transformer import DecisionTransformer
+from lerobot_unimask.networks.feedforward import FeedForward
+from lerobot_unimask.networks.transformer import Transformer
+from lerobot_unimask.window import Factor
+
+if TYPE_CHECKING:
+    from lerobot_unimask.configuration_unimask import UniMASKConfig
+
+
+def make_network(config: "UniMASKConfig", factors: dict[str, Factor]) -> nn.Module:
+    """The network that the config names, for these factors.
+
+    Raises:
+        ValueError: the network needs a factor that is not there.
+    """
+    shared = {
+        "context_length": config.context_length,
+        "fine_inputs": config.fine_inputs,
+        "width": config.width,
+        "depth": config.depth,
+        "feedforward_width": config.feedforward_width,
+        "dropout": config.dropout,
+    }
+    match config.network:
+        case "transformer":
+            return Transformer(factors, stacked=config.token_layout == "stacked", heads=config.heads, **shared)
+        case "feedforward":
+            return FeedForward(factors, **shared)
+        case "decision_gpt":
+            return DecisionGPT(factors, heads=config.heads, **shared)
+        case "decision_transformer":
+            return DecisionTransformer(factors, heads=config.heads, **shared)

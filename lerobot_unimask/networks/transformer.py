@@ -1,7 +1,13 @@
-"""The paper's network: a bidirectional transformer encoder over the steps of a window (paper, section 2.2, appendix D).
+"""A transformer over the tokens of a window that attends in both directions, as the paper's does (section 2.2, appendix
+D), or causally, with the same weights.
+
+In both directions, a hidden token's output predicts that token. Causally, a token's output predicts the next one, given
+it and those before it, so that one pass answers for every step of a window.
 
 Legend of shapes: B windows, K steps, F factors, N tokens, D the dimensions of a factor, W width, H heads.
 """
+
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -38,16 +44,63 @@ class NumberEncoding(nn.Module):
         """(B, K, d), 0 where hidden, and (B, K) -> (B, K, size)"""
         if not self.fine:
             return value
-        K = value.shape[1]
-        steps = torch.arange(K, device=value.device)
-        latest = torch.where(visible, steps, -1).cummax(1).values  # (B, K) the last shown step up to here
-        previous = functional.pad(latest, (1, -1), value=-1)  # ... before here
+        previous = _previous_shown(visible)
         both = (visible & (previous >= 0)).unsqueeze(-1)
-        start = value.gather(1, previous.clamp_min(0).unsqueeze(-1).expand_as(value))
-        displacement = torch.where(both, (value - start) / (steps - previous).unsqueeze(-1), 0.0)
+        gap = torch.arange(value.shape[1], device=value.device) - previous
+        displacement = torch.where(both, (value - _at(value, previous)) / gap.unsqueeze(-1), 0.0)
         scaled = torch.tanh(displacement.unsqueeze(-1) * self.scales).flatten(2)
         angles = (value.unsqueeze(-1) * self.frequencies).flatten(2)
         return torch.cat([value, angles.sin(), angles.cos(), scaled, both.to(value.dtype)], dim=-1)
+
+
+def course(value: Tensor, visible: Tensor, causal: Tensor | bool) -> Tensor:
+    """Where values would be on the straight course through those shown nearest: between one before and one after, on
+    from the last two before, or back from the first two after; 0 where nothing is shown.
+
+    Predicted as departures from it, states some steps ahead are exact from the start to within what bends the course,
+    which in a squared error over whole windows would weigh too little to be learnt.
+
+    Args:
+        value: (B, K, d), 0 where hidden.
+        visible: (B, K)
+        causal: for all or each window, (B,): only what is before counts.
+
+    Returns:
+        (B, K, d)
+    """
+    steps = torch.arange(value.shape[1], device=value.device)
+    before = _previous_shown(visible)
+    onwards = _extrapolate(value, before)
+    if causal is True:
+        return onwards
+    after = value.shape[1] - 1 - _previous_shown(visible.flip(1)).flip(1)  # K: nothing after
+    backwards = _extrapolate(value.flip(1), _previous_shown(visible.flip(1))).flip(1)
+    share = ((steps - before) / (after - before)).unsqueeze(-1)
+    between = torch.lerp(_at(value, before), _at(value, after), share)
+    any_before, any_after = (before >= 0).unsqueeze(-1), (after < len(steps)).unsqueeze(-1)
+    both_ways = torch.where(any_before & any_after, between, torch.where(any_before, onwards, backwards))
+    return both_ways if causal is False else torch.where(causal[:, None, None], onwards, both_ways)
+
+
+def _previous_shown(visible: Tensor) -> Tensor:
+    """(B, K) -> (B, K): the last shown step before each, -1 where there is none."""
+    steps = torch.arange(visible.shape[1], device=visible.device)
+    return functional.pad(torch.where(visible, steps, -1).cummax(1).values, (1, -1), value=-1)
+
+
+def _at(value: Tensor, step: Tensor) -> Tensor:
+    """Values (B, K, d) at the steps (B, K); any where there is no such step."""
+    return value.gather(1, step.clamp(0, value.shape[1] - 1).unsqueeze(-1).expand_as(value))
+
+
+def _extrapolate(value: Tensor, last: Tensor) -> Tensor:
+    """On from the last shown step before each, (B, K), with the slope since the one before that, if there is one."""
+    steps = torch.arange(value.shape[1], device=value.device)
+    before_last = torch.where(last >= 0, last.gather(1, last.clamp_min(0)), -1)
+    start, earlier = _at(value, last), _at(value, before_last)
+    slope = (start - earlier) / (last - before_last).clamp_min(1).unsqueeze(-1)
+    slope = torch.where((before_last >= 0).unsqueeze(-1), slope, 0.0)
+    return torch.where((last >= 0).unsqueeze(-1), start + slope * (steps - last).unsqueeze(-1), 0.0)
 
 
 class FactorEmbedding(nn.Module):
@@ -76,8 +129,22 @@ class FactorEmbedding(nn.Module):
         return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
 
 
+@dataclass
+class Cache:
+    """What causal attention has computed for a window's first n tokens: their inputs, (B, n, W), and each block's keys
+    and values, (B, H, n, W/H)."""
+
+    inputs: Tensor | None = None
+    keys: list[Tensor] = field(default_factory=list)
+    values: list[Tensor] = field(default_factory=list)
+
+    def matches(self, x: Tensor) -> bool:
+        """Whether (B, N, W) begins with the tokens that are kept; nothing else could be answered from them."""
+        return self.inputs is not None and torch.equal(x[:, : self.inputs.shape[1]], self.inputs)
+
+
 class Block(nn.Module):
-    """Self-attention in both directions, then a feed-forward network, each behind a layer norm."""
+    """Self-attention, then a feed-forward network, each behind a layer norm."""
 
     def __init__(self, width: int, heads: int, feedforward_width: int, dropout: float):
         super().__init__()
@@ -91,16 +158,31 @@ class Block(nn.Module):
             nn.Linear(width, feedforward_width), nn.GELU(), nn.Linear(feedforward_width, width), nn.Dropout(dropout)
         )
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, N, W) -> (B, N, W)"""
-        B, N, W = x.shape
-        qkv = self.query_key_value(self.norm_attention(x)).view(B, N, 3, self.heads, W // self.heads)
-        query, key, value = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, N, W/H)
+    def forward(
+        self, x: Tensor, attend: Tensor | None, past: tuple[Tensor, Tensor] | None
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """
+        Args:
+            x: (B, n, W), the last n of N tokens.
+            attend: which of the N tokens each of the n sees, True = seen; None: all.
+            past: keys and values of the tokens before them, (B, H, N - n, W/H).
+
+        Returns:
+            (B, n, W), and the keys and values of all N tokens.
+        """
+        B, n, W = x.shape
+        qkv = self.query_key_value(self.norm_attention(x)).view(B, n, 3, self.heads, W // self.heads)
+        if x.device.type == "cpu":
+            qkv = qkv.float()  # mixed precision: here the backward pass in bfloat16 takes ten times as long
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, n, W/H)
+        if past is not None:
+            key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
         dropout = self.dropout if self.training else 0.0
-        attended = functional.scaled_dot_product_attention(query, key, value, dropout_p=dropout)
-        attended = self.project(attended.transpose(1, 2).reshape(B, N, W))
+        with torch.autocast("cpu", enabled=False):
+            attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=attend, dropout_p=dropout)
+        attended = self.project(attended.transpose(1, 2).reshape(B, n, W))
         x = x + functional.dropout(attended, self.dropout, self.training)
-        return x + self.feedforward(self.norm_feedforward(x))
+        return x + self.feedforward(self.norm_feedforward(x)), (key, value)
 
 
 class Transformer(nn.Module):
@@ -108,9 +190,11 @@ class Transformer(nn.Module):
 
     Args:
         factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
-        stacked: one token per step, made of all its factors (paper, appendix "Input stacking"); otherwise one token
-            for each property, at the front, and one for each state and action, in the order of time.
-        fine_inputs: encode continuous values as `NumberEncoding` does.
+        stacked: one token per step, made of all its factors (paper, appendix "Input stacking"), which cannot attend
+            causally; otherwise one token for each property, at the front, and one for each state and action, in the
+            order of time.
+        fine_inputs: encode continuous values as `NumberEncoding` does, and predict continuous states as departures from
+            their `course`.
     """
 
     def __init__(
@@ -137,26 +221,84 @@ class Transformer(nn.Module):
         tokens = context_length if stacked else len(self.properties) + len(ASKABLE) * context_length
         self.positions = nn.Parameter(0.02 * torch.randn(tokens, width))  # within the window, not the episode
         self.dropout = nn.Dropout(dropout)
-        self.blocks = nn.Sequential(*(Block(width, heads, feedforward_width, dropout) for _ in range(depth)))
+        self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
+        self.on_course = {
+            i: c.dims for i, c in enumerate(factors["s"].components) if fine_inputs and not c.discrete
+        }  # which of the states' components, and their dimensions
         self.heads = nn.ModuleDict({name: nn.Linear(width, sum(sizes)) for name, sizes in self.sizes.items()})
 
-    def forward(self, window: Window, visible: dict[str, Tensor]) -> Predictions:
+    def forward(
+        self,
+        window: Window,
+        visible: dict[str, Tensor],
+        causal: Tensor | bool = False,
+        cache: Cache | None = None,
+    ) -> Predictions:
         """For every step, logits of discrete components, and of continuous ones normalised means, or means and the
         logarithms of scales.
 
         Args:
             window: normalised values.
             visible: factor -> (B, K) bool, True = shown.
+            causal: whether tokens see only those before them, for all windows or each, (B,) bool. The prediction for a
+                token is then made from the one before it, and does not depend on whether itself is shown.
+            cache: of a rollout, with `causal=True`: only what it does not hold yet is computed, up to the last token
+                shown; only the prediction for the next one means something.
         """
         tokens = {name: embed(window.values[name], visible[name]) for name, embed in self.embeddings.items()}
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
-        x = self.norm(self.blocks(self.dropout(x + self.positions)))
+        x = self.dropout(x + self.positions)
+        x = self._attend(x, causal) if cache is None else self._extend(x, self._count(visible), cache)
+        x = self.norm(x)
+        if causal is not False:  # the token before; nothing stands before the first one
+            before = functional.pad(x, (0, 0, 1, -1))
+            x = before if causal is True else torch.where(causal[:, None, None], before, x)
         per_factor = dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x)
-        return {
-            name: list(self.heads[name](per_factor[name]).split(sizes, dim=-1)) for name, sizes in self.sizes.items()
-        }
+        with torch.autocast(x.device.type, enabled=False):  # answers in full precision also under mixed precision
+            predictions = {
+                name: list(self.heads[name](per_factor[name].float()).split(sizes, dim=-1))
+                for name, sizes in self.sizes.items()
+            }
+        if self.on_course:
+            states = torch.where(visible["s"].unsqueeze(-1), window.values["s"], 0.0)
+            ahead = course(states, visible["s"], causal)
+            for i, dims in self.on_course.items():
+                output = predictions["s"][i]
+                mean = output[..., : dims.stop - dims.start] + ahead[..., dims]
+                predictions["s"][i] = torch.cat([mean, output[..., dims.stop - dims.start :]], dim=-1)
+        return predictions
+
+    def _attend(self, x: Tensor, causal: Tensor | bool) -> Tensor:
+        """All tokens, (B, N, W) -> (B, N, W)."""
+        attend = None
+        if causal is not False:
+            attend = _before_or_here(x.shape[1], x.device)  # (N, N)
+            if causal is not True:
+                attend = attend | ~causal[:, None, None, None]  # (B, 1, N, N)
+        for block in self.blocks:
+            x, _ = block(x, attend, None)
+        return x
+
+    def _extend(self, x: Tensor, count: int, cache: Cache) -> Tensor:
+        """The first `count` tokens of (B, N, W), those alone that the cache lacks; elsewhere 0."""
+        if not cache.matches(x[:, :count]) or cache.inputs.shape[1] == count:
+            cache.inputs, cache.keys, cache.values = None, [], []
+        start = 0 if cache.inputs is None else cache.inputs.shape[1]
+        attend = _before_or_here(count, x.device)[start:]
+        new = x[:, start:count]
+        for depth, block in enumerate(self.blocks):
+            new, kept = block(new, attend, (cache.keys[depth], cache.values[depth]) if start else None)
+            cache.keys[depth : depth + 1], cache.values[depth : depth + 1] = [kept[0]], [kept[1]]
+        cache.inputs = x[:, :count]
+        return functional.pad(new, (0, 0, start, x.shape[1] - count))
+
+    def _count(self, visible: dict[str, Tensor]) -> int:
+        """Tokens up to the last state or action that is shown in some window."""
+        steps = torch.stack([visible[name].any(0) for name in ASKABLE], dim=1).flatten()  # (2 K,)
+        shown = steps.nonzero()
+        return len(self.properties) + (int(shown[-1]) + 1 if len(shown) else 0)
 
     def _stack(self, tokens: dict[str, Tensor]) -> Tensor:
         return self.stack(torch.cat(list(tokens.values()), dim=-1))  # (B, K, F W) -> (B, K, W)
@@ -169,3 +311,8 @@ class Transformer(nn.Module):
     def _split(self, x: Tensor) -> dict[str, Tensor]:
         steps = x[:, len(self.properties) :].unflatten(1, (-1, len(ASKABLE)))  # (B, K, 2, W)
         return {name: steps[:, :, i] for i, name in enumerate(ASKABLE)}
+
+
+def _before_or_here(tokens: int, device: torch.device) -> Tensor:
+    """(N, N) bool: row i sees column j, j <= i."""
+    return torch.ones(tokens, tokens, dtype=torch.bool, device=device).tril()

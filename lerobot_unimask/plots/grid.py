@@ -1,45 +1,40 @@
-"""Pictures of answers: each function makes one matplotlib Figure, without pyplot, so no display or backend is needed.
-
-Colours are those of Okabe and Ito (2008), which colour-blind readers can tell apart; time runs along viridis. Figures
-are 9 inches wide: saved with `figure.savefig(path, dpi=200)` they read well at 900 pixels.
-"""
+"""DoorKey: rooms, trajectories and predicted states, one square for each cell."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from matplotlib.path import Path
 
 from lerobot_unimask.envs.doorkey import CELLS, DOOR, GOAL, coordinates
 from lerobot_unimask.experiments.gridworld import Panel, given_states
 from lerobot_unimask.inference import Answer
-from lerobot_unimask.masks import Mask
+from lerobot_unimask.plots.style import (
+    BLACK,
+    FAINT,
+    GREEN,
+    LEAST,
+    MONOSPACE,
+    NORMAL,
+    ORANGE,
+    PURPLE,
+    SMALL,
+    TIME,
+    VERMILLION,
+    WALL,
+    WIDTH,
+    shown_handle,
+    square,
+    time_colours,
+)
 
-# From Okabe and Ito's palette
-BLACK, ORANGE, GREEN = "#000000", "#E69F00", "#009E73"
-BLUE, VERMILLION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
-WALL, FAINT = "#4D4D4D", "#E6E6E6"
-
-WIDTH = 9.0  # inches
-SMALL, NORMAL = 7.0, 9.0  # points
-MONOSPACE = "DejaVu Sans Mono"  # comes with matplotlib
-
-# viridis without its palest end, which white paper swallows
-TIME = LinearSegmentedColormap.from_list("time", matplotlib.colormaps["viridis"](np.linspace(0.0, 0.88, 256)))
-LEAST = 0.01  # probabilities below this are not drawn
-
-# How a token of a mask is drawn
-SHOWN = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 1.2}
-ASKED = {"facecolor": "#FBE9DD", "edgecolor": VERMILLION, "linewidth": 1.2}
-HIDDEN = {"facecolor": "#F2F2F2", "edgecolor": "#CFCFCF", "linewidth": 0.6}
+FEW = 5  # trajectories that fit into a cell side by side
 
 
 # --- The grid ---------------------------------------------------------------------------------------------------------
@@ -50,20 +45,16 @@ def draw_grid(axes: Axes) -> None:
     x, y = coordinates(CELLS)
     wall = (x == coordinates(DOOR)[0]) & (CELLS != DOOR)
     for cell_x, cell_y, solid in zip(x, y, wall, strict=True):
-        _square(axes, cell_x, cell_y, facecolor=WALL if solid else "white", edgecolor=FAINT, linewidth=0.6, zorder=0)
-    _square(axes, *coordinates(GOAL), facecolor=GREEN, alpha=0.45, linewidth=0, zorder=0.2)
+        square(axes, cell_x, cell_y, facecolor=WALL if solid else "white", edgecolor=FAINT, linewidth=0.6, zorder=0)
+    square(axes, *coordinates(GOAL), facecolor=GREEN, alpha=0.45, linewidth=0, zorder=0.2)
     door_x, door_y = coordinates(DOOR)
-    _square(axes, door_x, door_y, facecolor=VERMILLION, alpha=0.18, linewidth=0, zorder=0.2)
+    square(axes, door_x, door_y, facecolor=VERMILLION, alpha=0.18, linewidth=0, zorder=0.2)
     axes.plot([door_x - 0.46] * 2, [door_y - 0.46, door_y + 0.46], color=VERMILLION, linewidth=3, zorder=0.4)
     axes.set(xlim=(0.5, x.max() + 0.5), ylim=(y.max() + 0.5, 0.5), aspect="equal")
     axes.set_xticks(np.unique(x))
     axes.set_yticks(np.unique(y))
     axes.tick_params(length=0, labelsize=SMALL, colors=WALL, pad=2)
     axes.spines[:].set(color=WALL, linewidth=2.5)
-
-
-def _square(axes: Axes, x: float, y: float, size: float = 1.0, **style) -> None:
-    axes.add_patch(Rectangle((x - size / 2, y - size / 2), size, size, **style))
 
 
 def _key_marker() -> Path:
@@ -92,7 +83,7 @@ def five_panels(panels: Sequence[Panel]) -> Figure:
     figure = Figure(figsize=(WIDTH, 2.72), layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
     steps = max(len(states) for panel in panels for states in panel.states)
-    time = _time(steps)
+    time = time_colours(steps)
     for number, (axes, panel) in enumerate(zip(row, panels, strict=True), start=1):
         draw_grid(axes)
         _draw_trajectories(axes, np.asarray(panel.states), time)
@@ -115,17 +106,55 @@ def five_panels(panels: Sequence[Panel]) -> Figure:
     return figure
 
 
-def _time(steps: int) -> ScalarMappable:
-    """The colours of steps 0 to steps - 1."""
-    return ScalarMappable(Normalize(0, steps - 1), TIME)
+def trajectories(
+    groups: Mapping[str, np.ndarray], *, captions: Sequence[str] = (), cell: int | None = None, most: int = 12
+) -> Figure:
+    """Trajectories that answer different questions, a grid for each, with jitter (the paper's property figure).
+
+    Args:
+        groups: What was asked, for people -> (N, T, 2) agent and key cells.
+        captions: A line below each grid.
+        cell: One to mark, of which the questions speak.
+        most: How many of each group are drawn; the first ones.
+    """
+    width = min(WIDTH, 2.7 * len(groups) + 0.9)
+    figure = Figure(figsize=(width, 3.1), layout="constrained")
+    row = figure.subplots(1, len(groups), squeeze=False)[0]
+    steps = max(states.shape[1] for states in groups.values())
+    time = time_colours(steps)
+    for axes, (name, states) in zip(row, groups.items(), strict=True):
+        draw_grid(axes)
+        _draw_trajectories(axes, states[:most], time)
+        if cell is not None:
+            square(axes, *coordinates(cell), size=0.92, fill=False, edgecolor=PURPLE, linewidth=2.5, zorder=1.5)
+        axes.set_title(name, fontsize=NORMAL, pad=4)
+    for axes, caption in zip(row, captions, strict=False):
+        axes.set_xlabel(caption, fontsize=SMALL + 0.5)
+    colorbar = figure.colorbar(time, ax=row, shrink=0.7, aspect=16, pad=0.02, ticks=range(0, steps, 3))
+    colorbar.set_label("step", fontsize=SMALL)
+    colorbar.ax.tick_params(labelsize=SMALL, length=2)
+    *points, given = _trajectory_handles()
+    given = [] if cell is None else [Patch(fill=False, edgecolor=PURPLE, linewidth=2, label="the cell in question")]
+    columns = 7 if len(groups) > 2 else 3
+    figure.legend(
+        handles=[*_grid_handles(), *points, *given],
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=SMALL,
+        frameon=False,
+    )
+    return figure
 
 
 def _draw_trajectories(axes: Axes, states: np.ndarray, time: ScalarMappable) -> None:
     """The agent's ways, (N, T, 2) agent and key cells, and where each one's key lay at first."""
     N, T, _ = states.shape
-    jitter = np.random.default_rng(0).uniform(-0.1, 0.1, size=(N, T, 2))  # always the same: part of the drawing
-    apart = 0.18 * (np.arange(N) - (N - 1) / 2)  # (N,)
-    points = np.stack(coordinates(states[..., 0]), axis=-1) + apart[:, None, None] + jitter  # (N, T, 2)
+    rng = np.random.default_rng(0)  # always the same: part of the drawing
+    jitter = rng.uniform(-0.1, 0.1, size=(N, T, 2))
+    apart = np.stack([0.18 * (np.arange(N) - (N - 1) / 2)] * 2, axis=-1)  # (N, 2)
+    if N > FEW:  # side by side they would leave their cells
+        apart = rng.uniform(-0.26, 0.26, size=(N, 2))
+    points = np.stack(coordinates(states[..., 0]), axis=-1) + apart[:, None] + jitter  # (N, T, 2)
     for way in points:
         _draw_way(axes, way, time.to_rgba(np.arange(T)))
     key_x, key_y = coordinates(np.unique(states[:, 0, 1]))
@@ -151,7 +180,7 @@ def _draw_given(axes: Axes, panel: Panel) -> None:
     """A frame around the agent's cell of each state that was given in advance."""
     for token, (_, state) in given_states(panel.given, len(panel.states[0])).items():
         x, y = coordinates(state[0])
-        _square(axes, x, y, fill=False, edgecolor=PURPLE, linewidth=2, linestyle=(0, (2.2, 1)), zorder=1.5)
+        square(axes, x, y, fill=False, edgecolor=PURPLE, linewidth=2, linestyle=(0, (2.2, 1)), zorder=1.5)
         axes.text(x - 0.42, y + 0.4, token, fontsize=SMALL - 1, family=MONOSPACE, zorder=6)
 
 
@@ -233,7 +262,7 @@ def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
     colorbar = figure.colorbar(probability, ax=figure.axes, shrink=0.7, aspect=22, pad=0.01)
     colorbar.set_label("probability of the agent's cell", fontsize=SMALL + 0.5)
     colorbar.ax.tick_params(labelsize=SMALL, length=2)
-    handles = [*_grid_handles(), _key_handle("key: the more solid, the likelier"), _shown_handle()]
+    handles = [*_grid_handles(), _key_handle("key: the more solid, the likelier"), shown_handle()]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=SMALL, frameon=False)
     return figure
 
@@ -243,7 +272,7 @@ def _draw_probabilities(axes: Axes, agent: np.ndarray, key: np.ndarray, probabil
     for cell in CELLS:
         x, y = coordinates(cell)
         if agent[cell] >= LEAST:
-            _square(axes, x, y, size=0.86, facecolor=probability.to_rgba(agent[cell]), zorder=1)
+            square(axes, x, y, size=0.86, facecolor=probability.to_rgba(agent[cell]), zorder=1)
             colour = "white" if agent[cell] > 0.55 else BLACK
             axes.text(
                 x, y + 0.2, f"{agent[cell]:.2f}", fontsize=SMALL, ha="center", va="center", color=colour, zorder=3
@@ -251,78 +280,3 @@ def _draw_probabilities(axes: Axes, agent: np.ndarray, key: np.ndarray, probabil
         if key[cell] >= LEAST:
             style = {"color": ORANGE, "edgecolors": BLACK, "linewidths": 0.4, "alpha": float(key[cell])}
             axes.scatter(x, y - 0.25, marker=KEY, s=120, zorder=2, **style)
-
-
-def _shown_handle() -> Patch:
-    return Patch(fill=False, edgecolor=PURPLE, linewidth=2, label="shown")
-
-
-# --- Masks ------------------------------------------------------------------------------------------------------------
-
-
-def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
-    """One window's mask: a row for each factor, a column for each step; shown, asked for, or neither.
-
-    Args:
-        mask: Of any questions and factors.
-        window: Which of the mask's windows.
-    """
-    names = list(mask.visible)
-    shown = np.stack([mask.visible[name][window].numpy(force=True) for name in names])  # (F, K)
-    asked = np.stack([mask.predict[name][window].numpy(force=True) for name in names])
-    F, K = shown.shape
-    figure = Figure(figsize=(min(WIDTH, 1.5 + 0.42 * K), 0.9 + 0.42 * F), layout="constrained")
-    axes = figure.subplots()
-    for row, step in np.ndindex(F, K):
-        mark, style = ("", HIDDEN)
-        if shown[row, step]:
-            mark, style = "", SHOWN
-        elif asked[row, step]:
-            mark, style = "?", ASKED
-        axes.add_patch(Rectangle((step - 0.42, row - 0.42), 0.84, 0.84, **style))
-        axes.text(step, row, mark, ha="center", va="center", fontsize=NORMAL, color=VERMILLION, fontweight="bold")
-    axes.set(xlim=(-0.5, K - 0.5), ylim=(F - 0.5, -0.5), aspect="equal", xlabel="step")
-    axes.set_yticks(range(F), names, family=MONOSPACE)
-    axes.set_xticks(range(0, K, max(1, K // 20)))
-    axes.tick_params(length=0, labelsize=NORMAL - 1)
-    axes.spines[:].set_visible(False)
-    handles = [
-        Patch(label="shown", **SHOWN),
-        Patch(label="asked for", **ASKED),
-        Patch(label="neither", **HIDDEN),
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=NORMAL - 1, frameon=False)
-    return figure
-
-
-# --- Experiments ------------------------------------------------------------------------------------------------------
-
-
-def learning_curves(record: Mapping[str, Any]) -> Figure:
-    """Mean return against updates, one line for each run, with bars of one standard error.
-
-    Args:
-        record: As `experiments.learning_curve` makes it.
-    """
-    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
-    axes = figure.subplots()
-    for run, colour, marker in zip(
-        record["runs"], (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, BLACK), "os^Dvx", strict=False
-    ):
-        points = run["checkpoints"]
-        axes.errorbar(
-            [point["updates"] for point in points],
-            [point["mean_return"] for point in points],
-            [point["standard_error"] for point in points],
-            color=colour,
-            marker=marker,
-            markersize=4,
-            linewidth=1.2,
-            capsize=2,
-            label=run["run"],
-        )
-    axes.set_xlabel("updates")
-    axes.set_ylabel("mean return")
-    axes.grid(color=FAINT)
-    axes.legend(fontsize=SMALL)
-    return figure

@@ -1,0 +1,345 @@
+"""Adds a column to a LeRobotDataset: a label of whole episodes, or a value for each frame, such as the return-to-go.
+
+LeRobot's own tool (`dataset_tools.add_features`) leaves the new column without statistics, which training needs, and
+rewrites the data in its row groups of one episode. Here files keep their layout, everything that is not about the new
+column stays as it is, and the labelled dataset appears whole or not at all.
+
+Shapes: N frames, E episodes, T steps of one episode, D numbers of the label.
+"""
+
+import contextlib
+import importlib
+import json
+import os
+import re
+import shutil
+import sys
+import uuid
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from tqdm import tqdm
+
+from dataset_builders.writer import (
+    PROVENANCE_PATH,
+    dataset_statistics,
+    episode_statistics,
+    provenance_of_now,
+    refuse_existing,
+)
+from lerobot_unimask.returns import return_to_go
+
+Episode = dict[str, np.ndarray]  # a dataset's columns of numbers: (T,) where D = 1, else (T, D)
+# One episode -> its label: a number or (D,) for all of it, or (T, D) with one row for each frame
+Labeller = Callable[[Episode], Any]
+
+
+# --- What to add ------------------------------------------------------------------------------------------------------
+
+
+def remaining_return(episode: Episode) -> np.ndarray:
+    """The return-to-go of each frame, (T, 1), from next.reward.
+
+    Raises:
+        ValueError: the dataset has no rewards.
+    """
+    if "next.reward" not in episode:
+        raise ValueError("The return-to-go is summed up from 'next.reward', which this dataset does not have.")
+    rewards = episode["next.reward"]
+    return return_to_go(rewards, np.array([len(rewards)]))[:, None]
+
+
+def visits(root: Path, condition: str) -> Labeller:
+    """Whether some step's state has a category, as in `agent_cell=0`.
+
+    Raises:
+        ValueError: the state has no such component or category.
+    """
+    features = _read_info(root)["features"]
+    known = {}  # component -> (column, which of its numbers, how many categories)
+    for key in ("observation.state", "observation.environment_state"):
+        entry = features.get(key, {})
+        for i, count in enumerate(entry.get("categories") or []):
+            names = entry.get("names") or [f"{key.removeprefix('observation.')}.{j}" for j in range(entry["shape"][0])]
+            known[names[i]] = key, i, count
+    name, equals, category = condition.partition("=")
+    if not equals or name not in known:
+        choices = ", ".join(f"{name}=0 to {name}={count - 1}" for name, (_, _, count) in known.items())
+        raise ValueError(f"visits is {condition!r}; this dataset's discrete states allow {choices or 'none at all'}.")
+    key, i, count = known[name]
+    if not category.isdecimal() or int(category) >= count:
+        raise ValueError(f"visits is {condition!r}; {name} is a category from 0 to {count - 1}.")
+    return lambda episode: bool((episode[key].reshape(len(episode[key]), -1)[:, i] == int(category)).any())
+
+
+def load_function(text: str) -> Labeller:
+    """A Python function by `module:name`; modules of the current folder are found too.
+
+    Raises:
+        ValueError: there is none.
+    """
+    module, colon, name = text.partition(":")
+    if not colon:
+        raise ValueError(f"function is {text!r}; write it as module:name.")
+    sys.path.insert(0, os.getcwd())
+    try:
+        function = getattr(importlib.import_module(module), name, None)
+    except ImportError as error:
+        raise ValueError(f"function is {text!r}, but the module {module} cannot be imported: {error}") from error
+    finally:
+        sys.path.remove(os.getcwd())
+    if not callable(function):
+        raise ValueError(f"function is {text!r}, but the module {module} has no function {name!r}.")
+    return function
+
+
+# --- Adding it --------------------------------------------------------------------------------------------------------
+
+
+def add_label(
+    root: str | Path,
+    name: str,
+    labeller: Labeller,
+    *,
+    how: str,
+    output: str | Path | None = None,
+    categories: int | None = None,
+    progress: bool = True,
+) -> Path:
+    """Add a column to a LeRobotDataset, with its statistics, completely or not at all.
+
+    Booleans and whole numbers become categories (int64), other numbers stay numbers (float32).
+
+    Args:
+        root: The dataset's folder.
+        name: The column's, `observation.NAME`: LeRobot reads windows of no other.
+        labeller: What to add; called with each episode in turn.
+        how: What it is, in words, for the dataset's `meta/provenance.json`.
+        output: Where to write the labelled dataset: new, or an existing empty folder; None: in place of the old one.
+        categories: How many, where not all of them occur.
+        progress: Show a progress bar, on a terminal.
+
+    Returns:
+        The labelled dataset's folder.
+
+    Raises:
+        FileNotFoundError: There is no dataset in `root`.
+        FileExistsError: `output` exists and is not an empty folder; it is left as it was.
+        ValueError: The column exists, or the labels do not make one.
+    """
+    root = Path(root).expanduser().resolve()
+    info = _read_info(root)
+    if not re.fullmatch(r"observation\.[\w.]+", name):
+        raise ValueError(f"name is {name!r}; a label is named observation.NAME, or LeRobot reads no windows of it.")
+    if name in info["features"]:
+        raise ValueError(f"{root} has a column {name} already; choose another name.")
+    target = root if output is None else refuse_existing(output)
+    column, lengths = _label_all(root, info, labeller, progress)
+    feature, column = _feature(column, categories)
+    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    try:
+        _copy_rest(root, partial)
+        info["features"][name] = feature
+        statistics = episode_statistics(column, lengths)
+        _write_data(root, partial, info, name, column)
+        _write_episodes(root, partial, name, statistics)
+        _write_meta(partial, info, name, dataset_statistics(statistics), how)
+        _put_in_place(partial, target, replacing=output is None)
+    except BaseException:  # Ctrl-C too
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return target
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    path = root / "meta" / "info.json"
+    if not path.exists():
+        raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
+    info = json.loads(path.read_text())
+    if not info.get("codebase_version", "").startswith("v3"):
+        raise ValueError(f"{root} is in LeRobot's format {info.get('codebase_version')}; only v3.0 can be labelled.")
+    return info
+
+
+def _data_files(root: Path) -> list[Path]:
+    """In the order in which LeRobot reads them."""
+    return sorted((root / "data").glob("*/*.parquet"))
+
+
+def _label_all(
+    root: Path, info: Mapping[str, Any], labeller: Labeller, progress: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """The labels of all frames, (N, D), and the episodes' lengths, (E,)."""
+    no_numbers = ("image", "video", "string", "language")
+    features = {key: entry for key, entry in info["features"].items() if entry["dtype"] not in no_numbers}
+    numbers = [key for key, entry in features.items() if len(entry["shape"]) == 1]
+    tables = [pq.read_table(path, columns=numbers) for path in _data_files(root)]
+    table = pa.concat_tables(tables)
+    columns = {key: _as_array(table.column(key), info["features"][key]["shape"][0]) for key in numbers}
+    starts = np.flatnonzero(np.diff(columns["episode_index"], prepend=-1))
+    lengths = np.diff(starts, append=len(table))
+    parts = []
+    episodes = zip(starts, lengths, strict=True)
+    for number, (start, length) in enumerate(
+        tqdm(episodes, desc="Labelling", total=len(starts), unit="episode", disable=None if progress else True)
+    ):
+        episode = {key: array[start : start + length] for key, array in columns.items()}
+        parts.append(_rows_of(labeller, episode, number, int(length)))
+        if parts[-1].shape[1] != parts[0].shape[1]:
+            raise ValueError(
+                f"The labels have different sizes: {parts[0].shape[1]} numbers in episode 0, {parts[-1].shape[1]} in "
+                f"episode {number}."
+            )
+    return np.concatenate(parts), lengths
+
+
+def _as_array(column: pa.ChunkedArray, size: int) -> np.ndarray:
+    """(N,) where size = 1, else (N, size)."""
+    array = column.combine_chunks()
+    if isinstance(array, pa.ChunkedArray):
+        array = pa.concat_arrays(array.chunks)
+    if size == 1 and not pa.types.is_nested(array.type):
+        return array.to_numpy(zero_copy_only=False)
+    return array.flatten().to_numpy(zero_copy_only=False).reshape(-1, size)
+
+
+def _rows_of(labeller: Labeller, episode: Episode, number: int, length: int) -> np.ndarray:
+    """One episode's label, (T, D)."""
+    try:
+        label = np.asarray(labeller(episode))
+    except ValueError:
+        raise
+    except Exception as error:  # the user's own function
+        raise ValueError(f"The label failed on episode {number}: {type(error).__name__}: {error}") from error
+    if label.dtype.kind not in "biuf" or not np.isfinite(label).all():
+        raise ValueError(f"The label of episode {number} is {label!r}; it must be finite numbers or booleans.")
+    if label.ndim == 2 and len(label) == length:
+        return label
+    if label.ndim > 1 or label.size == 0 or (label.ndim == 1 and len(label) == length > 1):
+        raise ValueError(
+            f"The label of episode {number} has shape {label.shape}, and the episode {length} steps: return one number "
+            f"or (D,) for the episode, or (T, D), here ({length}, 1), for its frames."
+        )
+    return np.tile(label.reshape(1, -1), (length, 1))
+
+
+def _feature(column: np.ndarray, categories: int | None) -> tuple[dict[str, Any], np.ndarray]:
+    """The feature's entry in info.json, and the column as it is stored."""
+    size = column.shape[1]
+    if column.dtype.kind == "f":
+        if categories is not None:
+            raise ValueError(f"categories is {categories}, but the labels are {column.dtype}: return whole numbers.")
+        return {"dtype": "float32", "shape": [size], "names": None}, column.astype(np.float32)
+    low, high = int(column.min()), int(column.max())
+    count = categories or (2 if column.dtype.kind == "b" else high + 1)
+    if low < 0 or high >= count:
+        raise ValueError(
+            f"The labels run from {low} to {high}; categories are numbered from 0 to {max(count, 1) - 1}. For numbers "
+            "that are not categories return floats."
+        )
+    feature = {"dtype": "int64", "shape": [size], "names": None, "categories": [count] * size}
+    return feature, column.astype(np.int64)
+
+
+# --- Files ------------------------------------------------------------------------------------------------------------
+
+
+def _copy_rest(root: Path, partial: Path) -> None:
+    """Everything that is not rewritten; large files that never change as links where the disk allows it."""
+    rewritten = {*_data_files(root), *_episode_files(root)}
+
+    def copy(source: str, target: str) -> None:
+        if Path(source) in rewritten:
+            return
+        if Path(source).relative_to(root).parts[0] in ("videos", "images"):
+            try:
+                os.link(source, target)
+                return
+            except OSError:
+                pass
+        shutil.copy2(source, target)
+
+    shutil.copytree(root, partial, copy_function=copy)
+
+
+def _episode_files(root: Path) -> list[Path]:
+    return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+
+
+def _write_data(root: Path, partial: Path, info: Mapping[str, Any], name: str, column: np.ndarray) -> None:
+    features = {key: {**entry, "shape": tuple(entry["shape"])} for key, entry in info["features"].items()}
+    schema = get_hf_features_from_features(features).arrow_schema
+    field, row = schema.field(name), 0
+
+    def with_label(table: pa.Table) -> pa.Table:
+        nonlocal row
+        part = column[row : row + len(table)]
+        row += len(table)
+        flat = pa.array(part.ravel())
+        array = flat if part.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, part.shape[1])
+        return table.append_column(field, array.cast(field.type)).replace_schema_metadata(schema.metadata)
+
+    for path in _data_files(root):
+        _rewrite(path, partial / path.relative_to(root), with_label)
+
+
+def _write_episodes(root: Path, partial: Path, name: str, statistics: Mapping[str, np.ndarray]) -> None:
+    def with_statistics(table: pa.Table) -> pa.Table:
+        rows = table.column("episode_index").to_numpy()
+        for statistic, values in statistics.items():  # (E, D)
+            chosen = values[rows] if statistic == "count" else values[rows].astype(np.float64)
+            offsets = np.arange(len(rows) + 1, dtype=np.int32) * chosen.shape[1]
+            array = pa.ListArray.from_arrays(offsets, pa.array(chosen.ravel()))
+            table = table.append_column(f"stats/{name}/{statistic}", array)
+        return table
+
+    for path in _episode_files(root):
+        _rewrite(path, partial / path.relative_to(root), with_statistics)
+
+
+def _rewrite(source: Path, target: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """A parquet file with each of its row groups changed: the new file has the old one's layout."""
+    with contextlib.ExitStack() as stack:
+        old, writer = stack.enter_context(pq.ParquetFile(source)), None
+        for i in range(old.num_row_groups):
+            table = change(old.read_row_group(i))
+            if writer is None:
+                writer = stack.enter_context(pq.ParquetWriter(target, table.schema, compression="snappy"))
+            writer.write_table(table)
+
+
+def _write_meta(
+    partial: Path, info: Mapping[str, Any], name: str, statistics: Mapping[str, np.ndarray], how: str
+) -> None:
+    stats = partial / "meta" / "stats.json"
+    known = json.loads(stats.read_text()) if stats.exists() else {}
+    known[name] = {statistic: value.tolist() for statistic, value in statistics.items()}
+    stats.write_text(json.dumps(known, indent=4))
+    (partial / "meta" / "info.json").write_text(json.dumps(info, indent=4))
+    path = partial / PROVENANCE_PATH
+    record = json.loads(path.read_text()) if path.exists() else {}
+    record.setdefault("labels", []).append({"name": name, "what": how, **provenance_of_now()})
+    path.write_text(json.dumps(record, indent=4) + "\n")
+
+
+def _put_in_place(partial: Path, target: Path, *, replacing: bool) -> None:
+    """The finished folder takes its name. In place of an old dataset, that one is set aside first and removed last."""
+    if not replacing:
+        if target.exists():
+            target.rmdir()  # fails, as it should, if somebody has put something there by now
+        partial.rename(target)
+        return
+    aside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.old")
+    try:
+        target.rename(aside)
+        partial.rename(target)
+    except BaseException:
+        if not target.exists():
+            aside.rename(target)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)

@@ -1,0 +1,304 @@
+"""The paper's heatmap: validation losses of training regimes x evaluation tasks in DoorKey (paper, appendix F).
+
+Every run trains one model of one row, number of episodes and seed, keeps the weights with the lowest validation loss of
+what it is trained on (the paper's early stopping), and is evaluated on every task that it answers; `finetune` is one
+model for each task, which goes on from the random-mask model of its seed. All are validated on the same windows and
+masks, as `unimask validate` does. The row `optimum` is the lowest loss that any model can have there in expectation.
+
+Note: The paper's losses are probably those of its authors' code (`expert=released`), whose questions in three columns
+    are slightly different ones; here they are the paper's definitions.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+
+from dataset_builders.doorkey import build_doorkey
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.envs.doorkey import FPS, HORIZON
+from lerobot_unimask.experiments.optimum import FEATURES, Optimum, entropies, mean_over_asked
+from lerobot_unimask.experiments.study import Run, key, run_study
+from lerobot_unimask.experiments.training import Trainer
+from lerobot_unimask.experiments.validation import answered, first_windows, read_first_windows, task_losses
+from lerobot_unimask.masks import RANDOM_MASK, TASKS, TrainingMasks
+from lerobot_unimask.modeling_unimask import VALIDATION_STEP
+from lerobot_unimask.window import make_window
+
+FINETUNE = "finetune"
+PAPER = Path(__file__).parent / "paper"
+
+# Row -> its policy's settings, over those of the config file
+_OWN_ATTENTION = {"attention": None, "token_layout": "separate"}
+ROWS: dict[str, dict[str, Any]] = {
+    **{task: {"training_masks": task} for task in TASKS},
+    "multi_task": {"training_masks": "multi_task"},
+    RANDOM_MASK: {"training_masks": RANDOM_MASK},
+    "acts_and_asks": {"training_masks": RANDOM_MASK, "attention": "both", "token_layout": "separate"},
+    **{
+        f"{network}_{task}": {"training_masks": task, "network": network, **_OWN_ATTENTION}
+        for network, tasks in {
+            "feedforward": ("behavior_cloning", RANDOM_MASK),
+            "decision_gpt": ("behavior_cloning", "reward_conditioned"),
+            "decision_transformer": ("behavior_cloning", "reward_conditioned"),
+        }.items()
+        for task in tasks
+    },
+}
+
+
+@dataclass
+class HeatmapConfig:
+    """A grid of runs, as its YAML file gives it."""
+
+    name: str = "heatmap"
+    # Of the study: runs of the same name in the same storage are shared.
+    rows: list[str] = field(default_factory=lambda: [*TASKS, "multi_task", RANDOM_MASK, FINETUNE])
+    # What is trained: names in `ROWS`, and finetune, which needs random_mask.
+    episodes: list[int] = field(default_factory=lambda: [500])
+    seeds: list[int] = field(default_factory=lambda: [0, 1])
+    expert: str = "released"
+    steps: int = 4000
+    finetune_steps: int = 1000
+    evaluate_every: int = 250
+    # Updates between validations, of which the best counts.
+    batch_size: int = 100
+    validation_episodes: int = 1000
+    policy: dict[str, Any] = field(default_factory=dict)
+    # Settings of every row's policy.
+    finetune_policy: dict[str, Any] = field(default_factory=dict)
+    # Settings that fine-tuning changes.
+    data: str = "data/heatmap"
+    # Folder of the datasets, which are built where they are missing.
+    output: str = "outputs/heatmap"
+    # Folder of the records, the table, the figure and the study's file.
+
+    def __post_init__(self) -> None:
+        unknown = [row for row in self.rows if row not in ROWS and row != FINETUNE]
+        if unknown:
+            raise ValueError(f"The heatmap has no row {unknown[0]!r}; its rows are {', '.join([*ROWS, FINETUNE])}.")
+        if FINETUNE in self.rows and RANDOM_MASK not in self.rows:
+            raise ValueError("The row finetune goes on from random_mask: add that row too.")
+        if min(self.steps, self.finetune_steps, self.evaluate_every, *self.episodes) < 1:
+            raise ValueError("steps, finetune_steps, evaluate_every and episodes must each be at least 1.")
+
+
+def heatmap(config: HeatmapConfig, *, storage: str | None = None, workers: int = 1, **study: Any) -> dict[str, Any]:
+    """Do what is left of the grid; write `heatmap.json`, `heatmap.md` and a figure for each number of episodes.
+
+    Returns:
+        The record that `heatmap.json` holds.
+    """
+    for episodes in config.episodes:
+        _build(config, _training_root(config, episodes), episodes, seed=0)
+    _build(config, _validation_root(config), config.validation_episodes, seed=1)
+    grid = [(episodes, seed) for episodes in config.episodes for seed in config.seeds]
+    first: list[Run] = [
+        {"row": row, "episodes": episodes, "seed": seed}
+        for episodes, seed in grid
+        for row in config.rows
+        if row != FINETUNE
+    ]
+    second: list[Run] = [
+        {"row": FINETUNE, "task": task, "episodes": episodes, "seed": seed}
+        for episodes, seed in grid
+        for task in (TASKS if FINETUNE in config.rows else ())
+    ]
+    output = Path(config.output)
+    share = partial(run_study, config.name, output=output, storage=storage, workers=workers, **study)
+    records = share(runs=first, execute=partial(execute, config))
+    if second:  # needs the first ones' weights
+        records += share(runs=second, execute=partial(execute, config))
+    record = {
+        "what": "validation loss in nats, its mean over seeds; one window from each episode's first step, t uniform",
+        "config": asdict(config),
+        "optimum": optimum_losses(config),
+        "losses": {
+            str(episodes): _table([one for one in records if one["episodes"] == episodes])
+            for episodes in config.episodes
+        },
+        "runs": records,
+    }
+    (output / "heatmap.json").write_text(json.dumps(record, indent=2) + "\n")
+    (output / "heatmap.md").write_text(markdown(record))
+    for episodes in config.episodes:
+        figure(record, episodes).savefig(output / f"heatmap_{episodes}.png", dpi=150)
+    return record
+
+
+def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
+    """One run: train, keep the best weights, evaluate."""
+    tuned = run["row"] == FINETUNE
+    settings = {**config.policy, "push_to_hub": False}
+    if tuned:
+        settings = {"training_masks": run["task"], **config.finetune_policy}
+    else:
+        settings |= ROWS[run["row"]]
+    steps = config.finetune_steps if tuned else config.steps
+    before = _checkpoint(config, run) if tuned else None
+    if before and not before.exists():
+        raise FileNotFoundError(f"{before} is not here: the random-mask model was trained on another machine.")
+    trainer = Trainer(
+        settings,
+        _training_root(config, run["episodes"]),
+        seed=run["seed"],
+        steps=steps,
+        batch_size=config.batch_size,
+        checkpoint=before,
+    )
+    policy = trainer.policy
+    batch = first_windows(policy, _validation_root(config), "local/validation")
+    own = policy.training_masks.weights
+
+    def validate() -> float:
+        losses = task_losses(policy, batch, own)
+        return sum(weight * losses[text] for text, weight in own.items()) / sum(own.values())
+
+    curve: dict[int, float] = {0: validate()} if tuned else {}
+    best = {name: value.clone() for name, value in policy.state_dict().items()}
+    for done, _ in enumerate(trainer, start=1):
+        if done % config.evaluate_every == 0 or done == steps:
+            curve[done] = validate()
+            if curve[done] == min(curve.values()):
+                best = {name: value.clone() for name, value in policy.state_dict().items()}
+    policy.load_state_dict(best)
+    if run["row"] == RANDOM_MASK:
+        policy.save_pretrained(_checkpoint(config, run))
+    tasks = [run["task"]] if tuned else [task for task in answered(policy, batch) if task in TASKS]
+    return {
+        "loss": min(curve.values()),
+        "updates": min(curve, key=curve.get),
+        "losses": task_losses(policy, batch, tasks),
+        "curve": curve,
+        "steps": steps,
+        "batch_size": config.batch_size,
+        "expert": config.expert,
+        "settings": settings,
+        "parameters": sum(parameter.numel() for parameter in policy.network.parameters()),
+        "device": str(policy.device),
+    }
+
+
+def optimum_losses(config: HeatmapConfig) -> dict[str, float]:
+    """The loss that no model can beat in expectation, on the validation windows and masks."""
+    K = config.policy.get("context_length", 10)
+    root = _validation_root(config)
+    batch = read_first_windows(UniMASKConfig(context_length=K), root, "local/validation")
+    window = make_window(batch, FEATURES, K, horizon=torch.tensor(float(HORIZON)), fps=torch.tensor(float(FPS)))
+    optimum = Optimum(config.expert)
+    losses = {}
+    for task in TASKS:
+        mask = TrainingMasks(task, tuple(FEATURES), K)(window.valid, batch["index"], seed=0, step=VALIDATION_STEP)
+        losses[task] = mean_over_asked(entropies(optimum(window, mask)), mask.predict)
+    return losses
+
+
+def _table(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Row -> task -> mean and spread (largest minus smallest) over seeds."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for record in records:
+        for task, loss in record["losses"].items():
+            found.setdefault(record["row"], {}).setdefault(task, []).append(loss)
+    return {
+        row: {task: {"mean": sum(v) / len(v), "spread": max(v) - min(v), "seeds": len(v)} for task, v in tasks.items()}
+        for row, tasks in found.items()
+    }
+
+
+def paper_losses(episodes: int) -> dict[str, dict[str, float]] | None:
+    """The paper's own numbers, row -> task -> loss; None for a number of episodes of which it gives none as numbers."""
+    path = PAPER / f"doorkey_heatmap_{episodes}.csv"
+    if not path.exists():
+        return None
+    with path.open() as file:
+        return {row["training"]: {task: float(row[task]) for task in TASKS} for row in csv.DictReader(file)}
+
+
+def markdown(record: Mapping[str, Any]) -> str:
+    """Tables of the losses, of the paper's and the difference, and of the losses over the lowest in each column."""
+    config = record["config"]
+    text = [
+        f"Validation losses in nats, `expert={config['expert']}`, {config['validation_episodes']} unseen episodes, "
+        f"mean of {len(config['seeds'])} seed(s). {config['steps']} updates of {config['batch_size']} windows, "
+        f"{config['finetune_steps']} more for finetune; of the weights after every {config['evaluate_every']} the best "
+        "on what they are trained on. In brackets: minus the paper's, where it gives a number. `optimum`: the lowest "
+        "possible in expectation.\n"
+    ]
+    for episodes, rows in record["losses"].items():
+        paper = paper_losses(int(episodes)) or {}
+        text += [f"\n**{episodes} episodes**\n", _header(), "| --- " * (1 + len(TASKS)) + "|"]
+        for row, tasks in rows.items():
+            text.append(_row(row, [_cell(tasks.get(task), paper.get(row, {}).get(task)) for task in TASKS]))
+        text.append(_row("optimum", [f"{record['optimum'][task]:.3f}" for task in TASKS]))
+        text += ["\nDivided by the lowest of each column:\n", _header(), "| --- " * (1 + len(TASKS)) + "|"]
+        for row, values in zip(rows, _normalised(rows), strict=True):
+            text.append(_row(row, ["" if math.isnan(value) else f"{value:.2f}" for value in values]))
+    return "\n".join(text) + "\n"
+
+
+def _header() -> str:
+    return _row("trained on", [task.replace("_", " ") for task in TASKS], code=False)
+
+
+def _row(name: str, cells: Sequence[str], *, code: bool = True) -> str:
+    return "| " + " | ".join([f"`{name}`" if code else name, *cells]) + " |"
+
+
+def _cell(ours: Mapping[str, float] | None, paper: float | None) -> str:
+    if ours is None:
+        return ""
+    return f"{ours['mean']:.3f}" + (f" ({ours['mean'] - paper:+.2f})" if paper is not None else "")
+
+
+def _normalised(rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[list[float]]:
+    """Each row's losses over the lowest in their column, as in the paper's figure; NaN where there is none."""
+    values = torch.tensor([[tasks.get(task, {}).get("mean", math.nan) for task in TASKS] for tasks in rows.values()])
+    lowest = values.nan_to_num(math.inf).min(0).values
+    return (values / lowest).tolist()
+
+
+def figure(record: Mapping[str, Any], episodes: int) -> Figure:
+    """The losses over the lowest of each column as colours, the losses themselves as numbers."""
+    rows = record["losses"][str(episodes)]
+    normalised = torch.tensor(_normalised(rows))
+    picture = Figure(figsize=(2 + 1.1 * len(TASKS), 1.8 + 0.42 * len(rows)), layout="constrained")
+    axes = picture.subplots()
+    image = axes.imshow(normalised.clamp(max=2).numpy(), vmin=1, vmax=2, cmap="viridis_r", aspect="auto")
+    for i, tasks in enumerate(rows.values()):
+        for j, task in enumerate(TASKS):
+            if task in tasks:
+                colour = "white" if normalised[i, j] > 1.5 else "black"
+                axes.text(j, i, f"{tasks[task]['mean']:.3g}", ha="center", va="center", color=colour, fontsize=9)
+    axes.set_xticks(range(len(TASKS)), [task.replace("_", "\n") for task in TASKS], fontsize=8)
+    axes.set_yticks(range(len(rows)), [row.replace("_", " ") for row in rows], fontsize=9)
+    axes.set_xlabel("evaluated on")
+    axes.set_ylabel("trained on")
+    axes.set_title(f"Validation loss in nats, {episodes} episodes", fontsize=10)
+    picture.colorbar(image, ax=axes, label="over the lowest of the column", extend="max")
+    return picture
+
+
+def _build(config: HeatmapConfig, root: Path, episodes: int, *, seed: int) -> None:
+    if not (root / "meta" / "info.json").exists():
+        build_doorkey(root, episodes=episodes, seed=seed, expert=config.expert, progress=False)
+
+
+def _training_root(config: HeatmapConfig, episodes: int) -> Path:
+    return Path(config.data) / f"{config.expert}_{episodes}"
+
+
+def _validation_root(config: HeatmapConfig) -> Path:
+    return Path(config.data) / f"{config.expert}_validation_{config.validation_episodes}"
+
+
+def _checkpoint(config: HeatmapConfig, run: Run) -> Path:
+    """Where the random-mask model of a run's episodes and seed is kept."""
+    model = {"row": RANDOM_MASK, "episodes": run["episodes"], "seed": run["seed"]}
+    return Path(config.output) / "checkpoints" / key(model)

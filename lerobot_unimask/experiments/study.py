@@ -1,0 +1,217 @@
+"""A grid of runs as an Optuna study: any number of workers, on any number of machines, share what is left to do.
+
+Each run is a trial that is enqueued with its specification; a worker takes the next one, runs it, and stores its
+record, JSON, with the trial and as a file. Nothing is run twice: not by a second worker, not after an interruption. A
+worker that dies stops its heartbeat, and another takes up what it was doing (Optuna's retry callback). The
+storage is an SQLite file, for one machine, or any database that Optuna supports.
+"""
+
+import fcntl
+import json
+import logging
+import multiprocessing
+import os
+import platform
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import draccus
+import optuna
+import torch
+import yaml
+from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
+from optuna.trial import FrozenTrial, TrialState
+
+Run = dict[str, Any]  # what makes a run: JSON values
+Execute = Callable[[Run], dict[str, Any]]  # does one; returns its record, JSON values, with a "loss"
+
+HEARTBEAT = 15  # seconds; a worker counts as dead after four
+_OPEN = (TrialState.WAITING, TrialState.RUNNING)
+
+logger = logging.getLogger(__name__)
+
+
+class _Storage(RDBStorage):
+    """Optuna's storage, with two gaps closed that killed workers fall into.
+
+    SQLite has no row locks, and two processes could take the same trial: a lock beside the file keeps them apart. And a
+    worker killed after taking a trial, before its first heartbeat, would never count as dead: here the heartbeat comes
+    first.
+    """
+
+    def __init__(self, url: str, heartbeat: int):
+        self.lock = url.removeprefix("sqlite:///") + ".lock" if url.startswith("sqlite:///") else None
+        super().__init__(
+            url,
+            engine_kwargs={"connect_args": {"timeout": 60}} if self.lock else None,
+            heartbeat_interval=heartbeat,
+            grace_period=4 * heartbeat,
+            heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(),
+        )
+
+    def set_trial_state_values(self, trial_id: int, state: TrialState, values: Sequence[float] | None = None) -> bool:
+        with open(self.lock, "a") if self.lock else nullcontext() as file:
+            if file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            if state == TrialState.RUNNING:
+                self.record_heartbeat(trial_id)
+            return super().set_trial_state_values(trial_id, state, values)
+
+
+def run_study(
+    name: str,
+    runs: Sequence[Run],
+    execute: Execute,
+    *,
+    output: Path,
+    storage: str | None = None,
+    workers: int = 1,
+    heartbeat: int = HEARTBEAT,
+) -> list[dict[str, Any]]:
+    """Do all runs that no one has done yet, and wait for those that others are doing.
+
+    Args:
+        name: the study's; runs of the same study are shared.
+        execute: does one run. With several workers it must be picklable.
+        output: folder; each record goes to `output/runs/KEY.json`.
+        storage: a database's URL; None: `sqlite:///OUTPUT/study.db`.
+        workers: processes to start here; with 1 this process works itself.
+        heartbeat: seconds.
+
+    Returns:
+        The records, in the order of `runs`.
+
+    Raises:
+        RuntimeError: some runs were not finished; the same call goes on with them.
+    """
+    (output / "runs").mkdir(parents=True, exist_ok=True)
+    storage = storage or f"sqlite:///{(output / 'study.db').resolve()}"
+    study = _open(name, storage, heartbeat)
+    known = {
+        key_of(trial) for trial in study.get_trials(deepcopy=False) if trial.state in (*_OPEN, TrialState.COMPLETE)
+    }
+    for run in runs:
+        if key(run) not in known:
+            study.enqueue_trial({}, user_attrs={"run": run})
+    arguments = (name, storage, execute, output, heartbeat)
+    if workers == 1:
+        work(*arguments)
+    else:
+        context = multiprocessing.get_context("spawn")
+        processes = [context.Process(target=_worker, args=arguments) for _ in range(workers)]
+        for process in processes:
+            process.start()
+        for process in processes:
+            process.join()
+    done = {key_of(trial): trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.COMPLETE}
+    missing = [key(run) for run in runs if key(run) not in done]
+    if missing:
+        raise RuntimeError(
+            f"{len(missing)} of {len(runs)} runs were not finished: {', '.join(missing[:5])}. "
+            "The same command goes on with them."
+        )
+    return [done[key(run)].user_attrs["record"] for run in runs]
+
+
+def work(name: str, storage: str, execute: Execute, output: Path, heartbeat: int) -> None:
+    """Take runs until none is waiting and none is being done."""
+    study = _open(name, storage, heartbeat)
+    while True:
+        with _without_warnings():
+            optuna.storages.fail_stale_trials(study)  # gives back what dead workers were doing
+        states = {trial.state for trial in study.get_trials(deepcopy=False)}
+        if TrialState.WAITING in states:
+            study.optimize(lambda trial: _objective(trial, study, execute, output), n_trials=1)
+        elif TrialState.RUNNING in states:
+            time.sleep(min(heartbeat, 5))
+        else:
+            return
+
+
+def _worker(*arguments: Any) -> None:
+    torch.set_num_threads(1)  # two threads beside another busy process are many times slower than one
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    work(*arguments)
+
+
+def _objective(trial: optuna.Trial, study: optuna.Study, execute: Execute, output: Path) -> float:
+    run = trial.user_attrs.get("run")
+    if run is None:  # another worker was quicker, and the queue was empty
+        raise optuna.TrialPruned
+    others = [other for other in study.get_trials(deepcopy=False) if key_of(other) == key(run)]
+    if any(o.number < trial.number and o.state in (*_OPEN, TrialState.COMPLETE) for o in others):
+        raise optuna.TrialPruned  # enqueued twice, by two machines at once
+    path = output / "runs" / f"{key(run)}.json"
+    if path.exists():  # done by a worker that died before it could say so
+        record = json.loads(path.read_text())
+    else:
+        began = time.monotonic()
+        record = execute(run)
+        record = {**run, **record, "wall_seconds": round(time.monotonic() - began, 1), "versions": versions()}
+        partial = path.with_suffix(f".{os.getpid()}")
+        partial.write_text(json.dumps(record, indent=2) + "\n")
+        partial.replace(path)  # at once: a record is there in full or not at all
+    trial.set_user_attr("record", record)
+    print(_progress(study, trial, record), flush=True)
+    return record["loss"]
+
+
+def _progress(study: optuna.Study, trial: optuna.Trial, record: dict[str, Any]) -> str:
+    trials = study.get_trials(deepcopy=False)
+    states = [other.state for other in trials]
+    done = states.count(TrialState.COMPLETE) + 1  # this one is about to be
+    left = sum(other.state in _OPEN for other in trials) - 1
+    times = [other.user_attrs["record"]["wall_seconds"] for other in trials if "record" in other.user_attrs]
+    minutes = left * sum(times) / len(times) / max(states.count(TrialState.RUNNING), 1) / 60
+    return (
+        f"{done} of {done + left} runs done: {key(record)}, loss {record['loss']:.4f}, {record['wall_seconds']:.0f} s; "
+        f"about {minutes:.0f} minutes left"
+    )
+
+
+def read_config[Config](kind: type[Config], path: Path) -> Config:
+    """A YAML file as a dataclass.
+
+    Raises:
+        ValueError: a setting that does not exist, or a value of the wrong type.
+    """
+    try:
+        return draccus.decode(kind, yaml.safe_load(path.read_text()) or {})
+    except (draccus.utils.DecodingError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    except draccus.utils.ParsingError as error:  # a value that the dataclass itself refuses
+        raise ValueError(f"{path}: {error.__cause__ or error}") from error
+
+
+def key(run: Run) -> str:
+    """A run's name: row, episodes or context length, and seed."""
+    return "-".join(str(run[name]) for name in ("row", "task", "episodes", "context_length", "seed") if name in run)
+
+
+def key_of(trial: FrozenTrial) -> str | None:
+    run = trial.user_attrs.get("run")
+    return key(run) if run else None
+
+
+def versions() -> dict[str, str]:
+    names = ("torch", "lerobot", "lerobot_policy_unimask", "optuna")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Optuna has called heartbeats and retries experimental since 2021."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        yield
+
+
+def _open(name: str, storage: str, heartbeat: int) -> optuna.Study:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    with _without_warnings():
+        return optuna.create_study(storage=_Storage(storage, heartbeat), study_name=name, load_if_exists=True)

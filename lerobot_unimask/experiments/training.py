@@ -1,0 +1,106 @@
+"""Training without LeRobot's command line: the same updates, in this process, for grids of many short runs.
+
+What `lerobot-train` does with one process and no workers, in the same order of random draws, over windows read in
+batches; a test holds the two to the same losses. No checkpoints, logs or evaluations: the caller does what it needs
+between updates.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.sampler import EpisodeAwareSampler
+from lerobot.policies.factory import make_policy
+from lerobot.utils.random_utils import set_seed
+from torch.utils.data import DataLoader
+
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+
+class Trainer:
+    """A policy, its data and its optimiser; iterating makes one update after another and yields each one's loss.
+
+    Args:
+        settings: of the policy, as `--policy.NAME=...`; over a checkpoint's own where one is given.
+        root: the dataset's folder.
+        seed: of the weights and of the data's order.
+        steps: updates to make.
+        checkpoint: to go on from (fine-tuning), else a new policy.
+        episodes: to train on, else all.
+
+    Raises:
+        FileNotFoundError: there is no dataset in `root`.
+        TypeError: a setting that the policy does not have.
+    """
+
+    def __init__(
+        self,
+        settings: dict[str, Any],
+        root: Path,
+        *,
+        seed: int,
+        steps: int,
+        batch_size: int,
+        checkpoint: Path | None = None,
+        episodes: list[int] | None = None,
+    ):
+        if not (root / "meta" / "info.json").exists():
+            raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
+        repo_id = "local/dataset"
+        meta = LeRobotDatasetMetadata(repo_id, root=root)
+        if checkpoint is None:
+            config = UniMASKConfig(**settings)
+        else:
+            config = PreTrainedConfig.from_pretrained(checkpoint)
+            for name, value in settings.items():
+                if not hasattr(config, name):
+                    raise TypeError(f"unimask has no setting {name!r}.")
+                setattr(config, name, value)
+            config.pretrained_path = checkpoint
+        set_seed(seed)
+        dataset = LeRobotDataset(
+            repo_id, root=root, delta_timestamps=resolve_delta_timestamps(config, meta), episodes=episodes
+        )
+        self.policy: UniMASKPolicy = make_policy(config, ds_meta=dataset.meta)
+        self.steps = steps
+        preset = config.get_optimizer_preset()
+        self.grad_clip_norm = preset.grad_clip_norm
+        self.optimizer = preset.build(self.policy.get_optim_params())
+        self.scheduler = config.get_scheduler_preset().build(self.optimizer, steps)
+        sampler = EpisodeAwareSampler(
+            dataset.meta.episodes["dataset_from_index"],
+            dataset.meta.episodes["dataset_to_index"],
+            episode_indices_to_use=dataset.episodes,
+            drop_n_last_frames=config.drop_n_last_frames,
+            shuffle=True,
+            seed=seed,
+            absolute_to_relative_idx=dataset.absolute_to_relative_idx,
+        )
+        self.loader = DataLoader(dataset, batch_size=batch_size, sampler=sampler)
+
+    def __iter__(self) -> Iterator[float]:
+        done = 0
+        while done < self.steps:
+            for batch in self.loader:  # another order in each epoch
+                yield self._update(batch)
+                done += 1
+                if done == self.steps:
+                    return
+
+    def _update(self, batch: dict[str, Any]) -> float:
+        self.policy.train()
+        with torch.autocast(self.policy.device.type, enabled=self.policy.config.use_amp):
+            loss, _ = self.policy.forward(batch)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.grad_clip_norm)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.scheduler.step()
+        self.policy.update()
+        return loss.item()

@@ -1,0 +1,111 @@
+"""Decision Transformer (Chen et al., NeurIPS 2021), a baseline of the paper.
+
+Legend of shapes: B windows, K steps, W width.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_unimask.masks import ASKABLE
+from lerobot_unimask.networks.transformer import Block, Cache, FactorEmbedding, Predictions
+from lerobot_unimask.window import Factor, Window
+
+TIMESTEPS = (
+    1000  # rows of the timestep embedding, as in the original: an episode's steps, or thousandths of a longer one
+)
+
+
+class DecisionTransformer(nn.Module):
+    """(window, visible) -> predictions: a causal transformer over return-to-go, state and action of every step.
+
+    A mask shows the return at a window's first step or not at all. Where it does, this network alone reads the later
+    steps' too: recorded ones in training, in a rollout the first lowered by the rewards received since. At step t it
+    reads those up to t, which follow from the first return and what has happened. For behaviour cloning no return is
+    shown.
+
+    Note: Departures from the original. The embedding of the timestep is of its share of the horizon, in thousandths,
+        because a window does not know the horizon: one row for each step of an episode of up to 1,000. Hidden returns
+        (behaviour cloning) are a learned embedding, where the original has no such tokens. Returns are normalised by
+        the dataset's statistics instead of divided by a constant. The blocks, the optimiser and the action's head are
+        this package's (layer norms in front, GELU, AdamW, no tanh). Where a state is asked for, which the original
+        never does, it is predicted from the action before it.
+
+    Args:
+        factors: what a step consists of; other properties than the return are not read.
+        fine_inputs: encode continuous values as `NumberEncoding` does.
+
+    Raises:
+        ValueError: there is no return factor.
+    """
+
+    def __init__(
+        self,
+        factors: dict[str, Factor],
+        *,
+        context_length: int,
+        fine_inputs: bool,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward_width: int,
+        dropout: float,
+    ):
+        super().__init__()
+        if "rtg" not in factors:
+            raise ValueError(
+                "network=decision_transformer reads a return at every step, and this dataset has no "
+                "'observation.return_to_go'; decision_gpt needs none."
+            )
+        self.embeddings = nn.ModuleDict(
+            {name: FactorEmbedding(factors[name], width, fine_inputs=fine_inputs) for name in ASKABLE}
+        )
+        self.returns = nn.Linear(1, width)
+        self.hidden_return = nn.Parameter(0.02 * torch.randn(width))
+        self.timesteps = nn.Embedding(TIMESTEPS + 1, width)
+        nn.init.normal_(self.timesteps.weight, std=0.02)
+        self.norm_inputs = nn.LayerNorm(width)
+        self.dropout = nn.Dropout(dropout)
+        self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
+        self.norm = nn.LayerNorm(width)
+        self.sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
+        self.heads = nn.ModuleDict({name: nn.Linear(width, sum(sizes)) for name, sizes in self.sizes.items()})
+        before = torch.ones(3 * context_length, 3 * context_length, dtype=torch.bool).tril()
+        self.register_buffer("before", before, persistent=False)
+
+    def forward(
+        self, window: Window, visible: dict[str, Tensor], causal: Tensor | bool = True, cache: Cache | None = None
+    ) -> Predictions:
+        """As `Transformer.forward`, causally whatever `causal` says; it keeps nothing in a cache.
+
+        Raises:
+            ValueError: the first return is shown and a later one, at a step whose state is shown, is not known.
+        """
+        tokens = [self._embed_returns(window, visible)]
+        tokens += [embed(window.values[name], visible[name]) for name, embed in self.embeddings.items()]
+        timestep = (window.values["rtg"][..., -1] * TIMESTEPS).round().long().clamp(0, TIMESTEPS)  # (B, K)
+        x = torch.stack(tokens, dim=2) + self.timesteps(timestep).unsqueeze(2)  # (B, K, 3, W)
+        x = self.dropout(self.norm_inputs(x.flatten(1, 2)))  # (B, 3 K, W): R0 s0 a0 R1 s1 a1 ...
+        for block in self.blocks:
+            x, _ = block(x, self.before, None)
+        _, at_state, at_action = self.norm(x).unflatten(1, (-1, 3)).unbind(2)  # each (B, K, W)
+        from_tokens = {"s": functional.pad(at_action, (0, 0, 1, -1)), "a": at_state}  # of s0, nothing comes before
+        with torch.autocast(x.device.type, enabled=False):  # answers in full precision also under mixed precision
+            return {
+                name: list(self.heads[name](from_tokens[name].float()).split(sizes, dim=-1))
+                for name, sizes in self.sizes.items()
+            }
+
+    def _embed_returns(self, window: Window, visible: dict[str, Tensor]) -> Tensor:
+        """(B, K, W)"""
+        returns = window.values["rtg"][..., :1]  # (B, K, 1)
+        shown = visible["rtg"][:, :1]  # (B, 1): of all steps, or none
+        known = returns[..., 0].isfinite()
+        if (shown & visible["s"] & ~known).any():
+            raise ValueError(
+                "A Decision Transformer reads the return-to-go of every step, and this window has that of its first "
+                "alone. Ask about a recorded window, or in a rollout whose environment reports "
+                "'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
+            )
+        read = (shown & known).unsqueeze(-1)
+        return torch.where(read, self.returns(torch.where(read, returns, 0.0)), self.hidden_return)

@@ -1,0 +1,74 @@
+"""A multi-layer perceptron over the whole window (paper, appendix "Detailed heatmaps": "Multi-layer Perceptron").
+
+Legend of shapes: B windows, K steps, N tokens, W width, H inner width.
+"""
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_unimask.masks import ASKABLE
+from lerobot_unimask.networks.transformer import Cache, FactorEmbedding, Predictions
+from lerobot_unimask.window import Factor, Window
+
+
+class FeedForward(nn.Module):
+    """(window, visible) -> predictions: every token embedded, hidden ones too, all of them end to end, then an MLP.
+
+    Note: The paper gives the sizes (embeddings of 32, three hidden layers of 128) and the masks, "the same maskings as
+        our transformer", and no more. Here a hidden token is a learned embedding, as in the transformer, which tells
+        the network the mask; the activation is GELU; a property is one token and not one for each step, because only
+        its first is ever shown; every token has weights of its own, so there are no position embeddings.
+
+    Args:
+        factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
+        fine_inputs: encode continuous values as `NumberEncoding` does.
+        width: of each token's embedding.
+        depth: hidden layers.
+        feedforward_width: of each hidden layer.
+    """
+
+    def __init__(
+        self,
+        factors: dict[str, Factor],
+        *,
+        context_length: int,
+        fine_inputs: bool,
+        width: int,
+        depth: int,
+        feedforward_width: int,
+        dropout: float,
+    ):
+        super().__init__()
+        self.context_length = context_length
+        self.embeddings = nn.ModuleDict(
+            {name: FactorEmbedding(factor, width, fine_inputs=fine_inputs) for name, factor in factors.items()}
+        )
+        tokens = sum(context_length if name in ASKABLE else 1 for name in factors)
+        widths = [tokens * width] + depth * [feedforward_width]
+        self.hidden = nn.Sequential(
+            *(
+                nn.Sequential(nn.Linear(before, after), nn.GELU(), nn.Dropout(dropout))
+                for before, after in pairwise(widths)
+            )
+        )
+        self.sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
+        self.heads = nn.ModuleDict(
+            {name: nn.Linear(feedforward_width, context_length * sum(sizes)) for name, sizes in self.sizes.items()}
+        )
+
+    def forward(
+        self, window: Window, visible: dict[str, Tensor], causal: Tensor | bool = False, cache: Cache | None = None
+    ) -> Predictions:
+        """As `Transformer.forward`; it sees the whole window whatever `causal` says, and keeps nothing in a cache."""
+        tokens = {name: embed(window.values[name], visible[name]) for name, embed in self.embeddings.items()}
+        x = torch.cat(
+            [token.flatten(1) if name in ASKABLE else token[:, 0] for name, token in tokens.items()], dim=1
+        )  # (B, N W)
+        x = self.hidden(x)  # (B, H)
+        with torch.autocast(x.device.type, enabled=False):  # answers in full precision also under mixed precision
+            return {
+                name: list(self.heads[name](x.float()).unflatten(1, (self.context_length, -1)).split(sizes, dim=-1))
+                for name, sizes in self.sizes.items()
+            }

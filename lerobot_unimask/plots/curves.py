@@ -1,0 +1,76 @@
+"""Records of experiments."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from lerobot_unimask.plots.style import COLOURS, FAINT, SMALL, WIDTH
+
+
+def learning_curves(record: Mapping[str, Any]) -> Figure:
+    """Mean return against updates, one line for each run, with bars of one standard error.
+
+    Args:
+        record: As `experiments.learning_curve` makes it.
+    """
+    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for run, colour, marker in zip(record["runs"], COLOURS, "os^Dvx", strict=False):
+        points = run["checkpoints"]
+        axes.errorbar(
+            [point["updates"] for point in points],
+            [point["mean_return"] for point in points],
+            [point["standard_error"] for point in points],
+            color=colour,
+            marker=marker,
+            markersize=4,
+            linewidth=1.2,
+            capsize=2,
+            label=run["run"],
+        )
+    axes.set_xlabel("updates")
+    axes.set_ylabel("mean return")
+    axes.grid(color=FAINT)
+    axes.legend(fontsize=SMALL)
+    return figure
+
+
+def cost_of_context(record: Mapping[str, Any]) -> Figure:
+    """Return, cost of an update and latency against the context length, each with its standard error over seeds.
+
+    Args:
+        record: As `experiments.ablation` makes it, of several context lengths.
+    """
+    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    panels = {
+        "mean return": {"behavior_cloning": "imitation", "reward_conditioned": "reward-conditioned"},
+        "processor time per update (ms)": {"ms_per_update": None},
+        "time per action (ms)": {"latency_ms": None},
+    }
+    lengths = record["config"]["context_lengths"]
+    for axes, (title, quantities) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        for variant in record["config"]["variants"]:
+            for (quantity, label), marker in zip(quantities.items(), "os", strict=False):
+                cells = [record["summary"][f"{variant}, K = {K}"][quantity] for K in lengths]
+                many = len(record["config"]["variants"]) > 1
+                axes.errorbar(
+                    lengths,
+                    [cell["mean"] for cell in cells],
+                    [cell["standard_error"] for cell in cells],
+                    color=COLOURS[list(quantities).index(quantity)],
+                    marker=marker,
+                    markersize=4,
+                    linewidth=1.2,
+                    capsize=2,
+                    label=", ".join(filter(None, [variant if many else None, label])),
+                )
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(lengths, [str(K) for K in lengths])
+        axes.set_xlabel("context length K")
+        axes.set_title(title, fontsize=SMALL)
+        if not title.startswith("mean"):
+            axes.set_ylim(bottom=0)
+        axes.grid(color=FAINT)
+    figure.axes[0].legend(fontsize=SMALL)
+    return figure

@@ -1,0 +1,475 @@
+"""`unimask query`: one question put to one policy, about an episode of a dataset or about values that are given.
+
+Everything that decides the answer is in the record, so that somebody else can ask the same question again.
+
+Legend of shapes: K steps of the window; there is one window.
+"""
+
+import contextlib
+import io
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.utils.data import default_collate
+
+from lerobot_unimask import hub, plots
+from lerobot_unimask.envs.doorkey import DynamicsCheck
+from lerobot_unimask.experiments.validation import checkpoints_of
+from lerobot_unimask.inference import Answer, Check, Given, Samples
+from lerobot_unimask.masks import ASKABLE, TASKS, Mask, MaskError, parse_token, tabulate
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.window import Window
+
+CHECKS = ("dynamics", "agreement")
+DOORKEY, MAZE2D = ["agent_cell", "key_cell"], ["x", "y", "goal_x", "goal_y"]  # by the names of their states' numbers
+
+
+# --- The policy -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A policy and where it came from.
+
+    path: a checkpoint's folder or a Hub repository.
+    revision: the commit hash of the latter, None of the former.
+    """
+
+    policy: UniMASKPolicy
+    path: str
+    revision: str | None
+
+
+def load_policy(path: str, revision: str | None = None) -> Loaded:
+    """Load a checkpoint: its folder, a lerobot-train output folder (its last one), or a Hub repository.
+
+    Args:
+        revision: of a Hub repository: a branch, tag or commit.
+
+    Raises:
+        FileNotFoundError: a folder that is neither.
+        HubError: a repository that cannot be had.
+        ValueError: it is another kind of policy.
+    """
+    local = Path(path).is_dir()
+    folder = checkpoints_of(Path(path))[-1] if local else hub.fetch(path, revision=revision)
+    kind = json.loads((folder / "config.json").read_text()).get("type")
+    if kind != "unimask":
+        raise ValueError(f"{path} is a policy of type {kind!r}; this command asks policies of type 'unimask'.")
+    with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
+        policy = UniMASKPolicy.from_pretrained(folder)
+    return Loaded(policy, str(folder) if local else path, hub.commit_of(folder))
+
+
+# --- The episode ------------------------------------------------------------------------------------------------------
+
+
+def open_dataset(policy: UniMASKPolicy, root: Path | None, repo_id: str) -> LeRobotDataset:
+    """A dataset whose items are windows of this policy.
+
+    Raises:
+        FileNotFoundError: there is no dataset in `root`. (LeRobot would ask the Hub for it.)
+    """
+    if root is not None and not (root / "meta" / "info.json").exists():
+        raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
+    meta = LeRobotDatasetMetadata(repo_id, root=root)
+    return LeRobotDataset(repo_id, root=root, delta_timestamps=resolve_delta_timestamps(policy.config, meta))
+
+
+def read_window(dataset: LeRobotDataset, episode: int, start: int = 0) -> dict[str, Tensor]:
+    """The window at one step of one episode, as a LeRobot batch of one.
+
+    Raises:
+        ValueError: there is no such episode or step.
+    """
+    episodes = len(dataset.meta.episodes)
+    if not 0 <= episode < episodes:
+        raise ValueError(f"There is no episode {episode}: this dataset's are 0 to {episodes - 1}.")
+    first, end = (dataset.meta.episodes[name][episode] for name in ("dataset_from_index", "dataset_to_index"))
+    if not 0 <= start < end - first:
+        raise ValueError(f"Episode {episode} has no step {start}: its steps are 0 to {end - first - 1}.")
+    return default_collate([dataset[first + start]])
+
+
+def middle_windows(dataset: LeRobotDataset, most: int = 200) -> dict[str, Tensor]:
+    """The windows in the middle of the first episodes, as a LeRobot batch."""
+    episodes = dataset.meta.episodes
+    bounds = zip(episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True)
+    return default_collate([dataset[(first + end) // 2] for first, end in list(bounds)[:most]])
+
+
+def given_from_episodes(
+    policy: UniMASKPolicy, dataset: LeRobotDataset, episodes: str, tokens: str
+) -> dict[str, list[Any]]:
+    """Waypoints, goals or properties of recorded episodes, a row for each: what `--policy.given` takes, for as many
+    environments side by side.
+
+    Args:
+        episodes: their numbers, `0:50` or `3,5,7`.
+        tokens: single tokens of the window at the episode's first step, `s[3], s[-1]`.
+
+    Raises:
+        MaskError: a token that the window does not have.
+        ValueError: no such episodes, or one that ends before a token's step or lacks its column.
+    """
+    numbers = episode_numbers(episodes, len(dataset.meta.episodes))
+    windows = [policy.make_window(read_window(dataset, number), partial=True) for number in numbers]
+    rows = {}
+    for text in re.findall(r"[^,\[]+\[[^\]]*\]", tokens) or [tokens]:
+        name, step = parse_token(text.strip(), tuple(policy.factors), policy.config.context_length)
+        factor = policy.factors[name]
+        values = torch.stack([window.values[name][0, step, : factor.given_size] for window in windows])
+        short = [number for number, window in zip(numbers, windows, strict=True) if not window.valid[0, step]]
+        if short or values.isnan().any():
+            where = f"episode {short[0]}, which is shorter" if short else "this dataset"
+            raise ValueError(f"{text.strip()} is not recorded in {where}.")
+        discrete = all(component.discrete for component in factor.components)
+        rows[text.strip()] = (values.long() if discrete else values).tolist()
+    return rows
+
+
+def episode_numbers(text: str, count: int) -> list[int]:
+    if match := re.fullmatch(r"(\d*):(\d*)", text):
+        numbers = list(range(int(match[1] or 0), int(match[2] or count)))
+    elif re.fullmatch(r"\d+(,\d+)*", text):
+        numbers = [int(number) for number in text.split(",")]
+    else:
+        numbers = []
+    if not numbers or max(numbers) >= count:
+        raise ValueError(f"episodes is {text!r}; write 0:50 or 3,5,7: this dataset's are 0 to {count - 1}.")
+    return numbers
+
+
+# --- The question -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How to draw joint samples instead of asking for marginals; see `UniMASKPolicy.sample`."""
+
+    samples: int
+    order: str = "forward"
+    seed: int = 0
+    check: str | None = None
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What came of a question: marginals, or samples where those were asked for; and what was recorded."""
+
+    mask: Mask
+    answer: Answer | Samples
+    recorded: Window | None
+
+
+def ask(
+    policy: UniMASKPolicy,
+    mask: str,
+    *,
+    batch: Mapping[str, Tensor] | None = None,
+    t: int | None = None,
+    given: Given | None = None,
+    sampling: Sampling | None = None,
+    start: int = 0,
+) -> Reply:
+    """Put one question to a policy.
+
+    Args:
+        batch: one recorded window, as `read_window` gives it; None where everything shown is in `given`.
+        start: the episode's step that the window begins at, of which a check may know.
+
+    Raises:
+        MaskError, ValueError: as `UniMASKPolicy.infer` and `sample`; or values are given for several windows.
+    """
+    recorded = None if batch is None else policy.make_window(batch, partial=True)
+    question = tabulate(mask, tuple(policy.factors), policy.config.context_length).at(t)
+    posed = question.to(policy.device)
+    if recorded is not None:
+        posed = posed.within(recorded.valid)
+        if not any(asked.any() for asked in posed.predict.values()):
+            raise ValueError(
+                f"The episode ends before what is asked: of the window's {policy.config.context_length} steps it has "
+                f"{int(recorded.valid.sum())}. Start earlier or ask for an earlier step."
+            )
+    if sampling is None:
+        answer = policy.infer(recorded, mask, t=t, given=given)
+        windows = len(answer.mask.visible["s"])
+    else:
+        answer = policy.sample(
+            recorded,
+            mask,
+            t=t,
+            given=given,
+            samples=sampling.samples,
+            order=sampling.order,
+            seed=sampling.seed,
+            check=make_check(policy, sampling.check, start),
+        )
+        windows = len(answer.valid) // sampling.samples
+    if windows > 1:
+        raise ValueError(f"Values for {windows} windows are given; give one value for each token.")
+    return Reply(posed, answer, recorded)
+
+
+def make_check(policy: UniMASKPolicy, name: str | None, start: int = 0) -> Check | None:
+    """A check by name: `dynamics`, that every step follows the rules, or `agreement`, that all of it is one episode.
+
+    Raises:
+        ValueError: the policy's environment offers none.
+    """
+    if name is None:
+        return None
+    if _labels(policy)["s"] != DOORKEY:
+        raise ValueError(
+            f"Only DoorKey offers its dynamics as a check; this policy's states are {_labels(policy)['s']}."
+        )
+    return DynamicsCheck(agree=name == "agreement", first_step=start)
+
+
+def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
+    """The answer token by token in the order of time, one row for each number of a token.
+
+    Marginals have `most_likely`, its `probability` and all `probabilities`, or `mean` and `scale` (None from an L2
+    head); samples `most_frequent`, its `share` and all `shares`, or `mean` and `scale` over the samples. `recorded` is
+    None where nothing is.
+    """
+    K = policy.config.context_length
+    table = []
+    for step in range(K):
+        for name in ASKABLE:
+            if not reply.mask.predict[name][0, step]:
+                continue
+            for component in policy.factors[name].components:
+                for i in range(component.dims.start, component.dims.stop):
+                    recorded = None
+                    if reply.recorded is not None and not math.isnan(reply.recorded.values[name][0, step, i]):
+                        recorded = _number(reply.recorded.values[name][0, step, i], component.discrete)
+                    if isinstance(reply.answer, Samples):
+                        said = _of_samples(reply.answer.values[name][:, step, i], component.categories)
+                    else:
+                        said = _of_marginals(reply.answer, name, step, i)
+                    row = {"token": f"{name}[{step}]", "step": step, "component": _labels(policy)[name][i]}
+                    table.append({**row, **said, "recorded": recorded})
+    return table
+
+
+def _of_marginals(answer: Answer, name: str, step: int, i: int) -> dict[str, Any]:
+    distribution = next(d for d in answer[name] if d.component.dims.start <= i < d.component.dims.stop)
+    if distribution.probabilities is None:
+        at = i - distribution.component.dims.start
+        scale = None if distribution.scale is None else distribution.scale[0, step, at].item()
+        return {"mean": distribution.mean[0, step, at].item(), "scale": scale}
+    probabilities = distribution.probabilities[0, step]
+    best = int(probabilities.argmax())
+    return {"most_likely": best, "probability": probabilities[best].item(), "probabilities": probabilities.tolist()}
+
+
+def _of_samples(values: Tensor, categories: int | None) -> dict[str, Any]:
+    if categories is None:
+        return {"mean": values.mean().item(), "scale": values.std(correction=0).item()}
+    shares = values.long().bincount(minlength=categories) / len(values)
+    best = int(shares.argmax())
+    return {"most_frequent": best, "share": shares[best].item(), "shares": shares.tolist()}
+
+
+def _number(value: Tensor, discrete: bool) -> int | float:
+    return int(value) if discrete else value.item()
+
+
+def _labels(policy: UniMASKPolicy) -> dict[str, list[str]]:
+    """factor -> the name of each of its numbers."""
+    labels = {}
+    for name, columns in policy.config.features.items():
+        plain = {f.key: f.key.removeprefix("observation.") for f in columns}
+        numbered = ([plain[f.key]] if f.size == 1 else [f"{plain[f.key]}.{i}" for i in range(f.size)] for f in columns)
+        labels[name] = [label for f, numbers in zip(columns, numbered, strict=True) for label in f.names or numbers]
+    return labels
+
+
+# --- Text and JSON ----------------------------------------------------------------------------------------------------
+
+
+def record(
+    loaded: Loaded,
+    mask: str,
+    reply: Reply,
+    *,
+    t: int | None,
+    given: Given | None,
+    data: Mapping[str, Any] | None,
+    sampling: Sampling | None,
+) -> dict[str, Any]:
+    """Everything that decides an answer, and the answer, for a JSON.
+
+    Args:
+        data: the dataset, episode and first step that were read.
+    """
+    result: dict[str, Any] = {
+        "policy": {"path": loaded.path, "revision": loaded.revision, "updates": int(loaded.policy.updates)},
+        "mask": mask,
+        "t": t,
+        "given": dict(given or {}),
+        "data": dict(data) if data is not None else None,
+        "drawing": reply.mask.draw(),
+        "answers": rows(loaded.policy, reply),
+    }
+    if sampling is not None and isinstance(reply.answer, Samples):
+        counts = {name: getattr(reply.answer, name) for name in ("drawn", "rejected", "restarted", "acceptance")}
+        values = {name: _plain(reply.answer.values[name].tolist()) for name in ASKABLE}
+        result["sampling"] = {**vars(sampling), **counts, "values": values}
+    return result
+
+
+def _plain(value: Any) -> Any:
+    """Nested lists with None for NaN, which JSON does not have."""
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return None if math.isnan(value) else value
+
+
+def describe(result: Mapping[str, Any]) -> str:
+    """A record as a table for people."""
+    asked_at = f", at t = {result['t']}" if result["t"] is not None else ""
+    lines = [f"{result['mask']}{asked_at}", f"  {result['drawing']}   (# shown, ? asked, . neither)"]
+    if result["given"]:
+        lines.append(f"  given {json.dumps(result['given'])}")
+    if result["data"] is not None:
+        data = result["data"]
+        lines.append(f"  episode {data['episode']} of {data['root'] or data['repo_id']}, from step {data['start']} on")
+    sampled = result.get("sampling")
+    if sampled:
+        lines.append(
+            f"  {sampled['samples']} samples, {sampled['order']}, seed {sampled['seed']}; check {sampled['check']}: "
+            f"{sampled['rejected']} of {sampled['drawn']} drawn tokens rejected,\n  acceptance "
+            f"{sampled['acceptance']:.1%}, {sampled['restarted']} samples started over"
+        )
+    return "\n".join([*lines, "", *_align(list(_cells(result["answers"], sampled is not None)))])
+
+
+def _cells(answers: Sequence[Mapping[str, Any]], sampled: bool) -> Iterator[list[str]]:
+    discrete = any("mean" not in row for row in answers)
+    continuous = any("mean" in row for row in answers)
+    value, weight = ("most frequent", "share") if sampled else ("most likely", "probability")
+    heads = [value if discrete else "", "mean" if continuous else ""]
+    weights = [weight if discrete else "", "scale" if continuous else ""]
+    yield ["step", "component", " / ".join(filter(None, heads)), " / ".join(filter(None, weights)), "recorded"]
+    for row in answers:
+        recorded = "" if row["recorded"] is None else f"{row['recorded']:.4g}"
+        if "mean" in row:
+            said = [f"{row['mean']:.4g}", "" if row["scale"] is None else f"± {row['scale']:.3g}"]
+        else:
+            said = [str(row[value.replace(" ", "_")]), f"{row[weight]:.3f}"]
+        yield [str(row["step"]), row["component"], *said, recorded]
+
+
+def _align(cells: Sequence[Sequence[str]]) -> list[str]:
+    """Columns of equal width, numbers to the right, names to the left."""
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    lines = []
+    for row in cells:
+        parts = [c.ljust(w) if i == 1 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        lines.append("  ".join(parts).rstrip())
+    return lines
+
+
+def overview(loaded: Loaded) -> dict[str, Any]:
+    """What one can ask a policy: its factors, and the named tasks that fit it, with their masks drawn."""
+    policy = loaded.policy
+    K = policy.config.context_length
+    factors = {}
+    for name, factor in policy.factors.items():
+        mean, std = (policy.statistics.get_buffer(f"{name}_{part}").tolist() for part in ("mean", "std"))
+        factors[name] = [
+            {"component": _labels(policy)[name][i], "categories": component.categories}
+            if component.discrete
+            else {"component": _labels(policy)[name][i], "mean": mean[i], "std": std[i]}
+            for component in factor.components
+            if not component.computed
+            for i in range(component.dims.start, component.dims.stop)
+        ]
+    tasks = []
+    for name, text in TASKS.items():
+        try:
+            table = tabulate(text, tuple(policy.factors), K)
+        except MaskError:
+            continue  # a factor that this model does not have
+        t = int(table.t[len(table.t) // 3])
+        mask = table.at(t)
+        drawing = mask.draw()
+        tasks.append({"name": name, "mask": text, "t": t, "drawing": drawing})
+    return {
+        "policy": {"path": loaded.path, "revision": loaded.revision, "updates": int(policy.updates)},
+        "context_length": K,
+        "attention": policy.config.attention,
+        "training_masks": policy.training_masks.weights,
+        "factors": factors,
+        "tasks": tasks,
+    }
+
+
+def describe_overview(result: Mapping[str, Any]) -> str:
+    """An overview as text for people."""
+    lines = [
+        f"{result['policy']['path']}: windows of {result['context_length']} steps, 0 to {result['context_length'] - 1}"
+    ]
+    lines += ["", "Factors, with the dataset's units:"]
+    width = max(map(len, result["factors"]))
+    for name, components in result["factors"].items():
+        where = "" if name in ASKABLE else f"; shown as {name}[0] or not at all"
+        for part in components:
+            kind = (
+                f"category 0 to {part['categories'] - 1}"
+                if "categories" in part
+                else f"number, {part['mean']:.4g} ± {part['std']:.3g} in the training data"
+            )
+            lines.append(f"  {name:{width}}  {part['component']}: {kind}{where}")
+    lines += ["", "Named tasks (# shown, ? asked, . neither):"]
+    name, mask = (max(len(task[key]) for task in result["tasks"]) for key in ("name", "mask"))
+    lines += [
+        f"  {task['name']:{name}}  {task['mask']:{mask}}  at t={task['t']}: {task['drawing']}"
+        for task in result["tasks"]
+    ]
+    lines += [
+        "",
+        "Ask for one with --mask=NAME --t=STEP, or write any question: --mask='s[1:9] | s[0], s[3]'.",
+        "What the mask shows comes from --dataset.root=DIR --episode=N, or from --given='{\"s[0]\": [...]}'.",
+    ]
+    return "\n".join(lines)
+
+
+# --- Pictures ---------------------------------------------------------------------------------------------------------
+
+
+def picture(policy: UniMASKPolicy, mask: str, reply: Reply) -> Figure:
+    """The picture that suits the environment and the answer; of any other model, its marginals or distributions."""
+    states = _labels(policy)["s"]
+    every_state = bool((reply.mask.visible["s"] | reply.mask.predict["s"]).all())
+    if isinstance(reply.answer, Samples):
+        if states == DOORKEY and every_state:
+            return plots.trajectories({mask: reply.answer.values["s"].long().numpy(force=True)})
+        groups = {"sampled": _known(reply.answer, reply.mask)}
+        if reply.recorded is not None:
+            groups = {"recorded": _known(reply.recorded, reply.mask), **groups}
+        return plots.distributions(groups, policy.factors)
+    if states == DOORKEY and every_state:
+        return plots.state_distributions(reply.answer)
+    if states == MAZE2D and reply.mask.predict["s"].any():
+        return plots.maze_trajectories(reply.answer, reply.recorded)
+    return plots.marginals(reply.answer, reply.recorded)
+
+
+def _known(window: Window, mask: Mask) -> Window:
+    """The window with NaN where nothing was asked."""
+    values = {name: torch.where(mask.predict[name].unsqueeze(-1), window.values[name], torch.nan) for name in ASKABLE}
+    return Window(values, window.valid)

@@ -1,0 +1,133 @@
+"""The heatmap: runs, records, tables and the figure from a small grid; what its losses are."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lerobot_unimask import TASKS, UniMASKPolicy, cli
+from lerobot_unimask.experiments.heatmap import (
+    FINETUNE,
+    ROWS,
+    HeatmapConfig,
+    heatmap,
+    markdown,
+    optimum_losses,
+    paper_losses,
+)
+from lerobot_unimask.experiments.study import read_config
+from lerobot_unimask.experiments.validation import first_windows, task_losses
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+SMALL = {
+    "device": "cpu",
+    "attention": "bidirectional",
+    "token_layout": "stacked",
+    "width": 16,
+    "depth": 1,
+    "heads": 2,
+    "feedforward_width": 16,
+}
+ANSWERED = {"random_mask": set(TASKS), "decision_transformer_reward_conditioned": {"reward_conditioned"}}
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory) -> HeatmapConfig:
+    folder = tmp_path_factory.mktemp("heatmap")
+    return HeatmapConfig(
+        rows=[*ANSWERED, FINETUNE],
+        episodes=[20],
+        seeds=[0, 1],
+        steps=6,
+        finetune_steps=4,
+        evaluate_every=2,
+        batch_size=8,
+        validation_episodes=30,
+        policy=SMALL,
+        finetune_policy={"optimizer_lr": 0.01},
+        data=str(folder / "data"),
+        output=str(folder / "output"),
+    )
+
+
+@pytest.fixture(scope="module")
+def record(config) -> dict:
+    return heatmap(config)
+
+
+def test_every_row_has_the_tasks_that_it_answers(config, record):
+    rows = record["losses"]["20"]
+    assert {row: set(tasks) for row, tasks in rows.items()} == ANSWERED | {FINETUNE: set(TASKS)}
+    assert all(cell["seeds"] == 2 and cell["spread"] > 0 for tasks in rows.values() for cell in tasks.values())
+    assert len(record["runs"]) == 2 * (2 + len(TASKS))
+    for run in record["runs"]:
+        assert run["loss"] == min(run["curve"].values())
+        assert run["steps"] == (4 if run["row"] == FINETUNE else 6)
+        assert run["versions"].keys() == {"python", "torch", "lerobot", "lerobot_policy_unimask", "optuna"}
+    json.dumps(record, allow_nan=False)
+    output = Path(config.output)
+    assert json.loads((output / "heatmap.json").read_text())["losses"] == record["losses"]
+    assert (output / "heatmap_20.png").stat().st_size > 10_000
+
+
+def test_a_cell_is_what_validate_finds_of_the_kept_weights(config, record):
+    """The random-mask model of seed 1, loaded from its checkpoint."""
+    policy = UniMASKPolicy.from_pretrained(Path(config.output) / "checkpoints" / "random_mask-20-1")
+    batch = first_windows(policy, Path(config.data) / "released_validation_30", "local/doorkey")
+    (run,) = (run for run in record["runs"] if run["row"] == "random_mask" and run["seed"] == 1)
+    assert run["losses"] == pytest.approx(task_losses(policy, batch, TASKS))
+    assert int(policy.updates) == run["updates"]
+
+
+def test_the_second_time_nothing_is_run(config, record, capsys):
+    assert heatmap(config) == record
+    assert "runs done" not in capsys.readouterr().out
+
+
+def test_the_optimum_is_below_every_model(config, record):
+    assert record["optimum"] == optimum_losses(config)
+    assert record["optimum"]["forward_dynamics"] == pytest.approx(0, abs=1e-9)
+    for tasks in record["losses"]["20"].values():
+        assert all(cell["mean"] > record["optimum"][task] for task, cell in tasks.items())
+
+
+def test_tables_show_the_difference_from_the_papers_numbers():
+    cell = {task: {"mean": 1.5, "spread": 0.0, "seeds": 1} for task in TASKS}
+    other = {task: {"mean": 3.0, "spread": 0.0, "seeds": 1} for task in TASKS if task != "past"}
+    config = {
+        "expert": "released", "validation_episodes": 1, "seeds": [0], "steps": 1, "batch_size": 1,
+        "evaluate_every": 1, "finetune_steps": 1,
+    }  # fmt: skip
+    text = markdown(
+        {"config": config, "losses": {"500": {"random_mask": cell, "other": other}}, "optimum": dict.fromkeys(TASKS, 1)}
+    )
+    assert paper_losses(500)["random_mask"]["past"] == 4.95
+    assert paper_losses(7) is None
+    assert "| `random_mask` | 1.500 (+0.31) | 1.500 (+0.36) |" in text
+    assert "| `other` | 3.000 | 3.000 | 3.000 | 3.000 |  | 3.000 |" in text
+    assert "| `other` | 2.00 | 2.00 | 2.00 | 2.00 |  | 2.00 |" in text
+
+
+@pytest.mark.parametrize("name", ["heatmap", "heatmap_quick"])
+def test_the_config_files_are_read(name):
+    assert set(read_config(HeatmapConfig, CONFIGS / f"{name}.yaml").rows) <= {*ROWS, FINETUNE}
+
+
+def test_bad_settings_are_named(tmp_path, capsys):
+    for text, message in (
+        ("rows: [mlp]", "has no row 'mlp'"),
+        ("rows: [finetune]", "goes on from random_mask"),
+        ("seedz: [0]", "seedz"),
+        ("steps: many", "steps"),
+    ):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(SystemExit):
+            cli.main(["heatmap", f"--config_path={tmp_path / 'bad.yaml'}"])
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_two_minute_form(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cli.main(["heatmap", f"--config_path={CONFIGS / 'heatmap_quick.yaml'}", "--workers=2"])
+    assert Path("outputs/heatmap_quick/heatmap_50.png").exists()

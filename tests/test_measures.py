@@ -1,0 +1,140 @@
+"""Measures against their definitions, and the ablation in a form that takes seconds."""
+
+import json
+
+import pytest
+import torch
+from torch.distributions import Categorical, Normal, kl_divergence
+
+from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+from lerobot_unimask.cli import main
+from lerobot_unimask.experiments.measures import (
+    _divergence,
+    disagreement,
+    error_ahead,
+    latency,
+    measure,
+    unseen_windows,
+)
+from lerobot_unimask.window import Component
+
+EPISODES, LAST = 4, [2, 3]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return build_maze2d(tmp_path_factory.mktemp("maze") / "dataset", episodes=EPISODES, seed=0, progress=False)
+
+
+@pytest.fixture
+def make(root):
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    meta = LeRobotDatasetMetadata("local/maze2d", root=root)
+
+    def policy(**settings):
+        small = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "dropout": 0.0, "context_length": 8}
+        config = UniMASKConfig(device="cpu", **(small | settings))
+        config.set_dataset_feature_metadata(meta.features)
+        torch.manual_seed(0)
+        return UniMASKPolicy(config, dataset_stats=meta.stats).eval()
+
+    return policy
+
+
+def test_windows_are_full_and_of_these_episodes_alone(make, root):
+    batch = unseen_windows(make(), root, LAST)
+    assert set(batch["episode_index"].tolist()) == set(LAST)
+    assert not batch["observation.state_is_pad"].any()
+    with pytest.raises(ValueError, match="None of these episodes"):
+        unseen_windows(make(context_length=300), root, LAST)
+
+
+def test_the_error_ahead_is_the_distance_to_the_true_state(make, root):
+    policy = make()
+    batch = unseen_windows(policy, root, LAST)
+    found = error_ahead(policy, batch, 3)  # from step 4 to step 7
+    states = batch["observation.state"]
+    answers = policy.infer(batch, "s[7] | s[:5], a[:4]").most_likely("s")[:, 7]
+    assert found["model"] == pytest.approx((answers - states[:, 7]).norm(dim=1).mean().item())
+    repeated = 4 * states[:, 4] - 3 * states[:, 3]
+    assert found["last_displacement_repeated"] == pytest.approx(
+        (repeated - states[:, 7]).norm(dim=1).mean().item(), rel=1e-4
+    )
+    assert found["windows"] == len(states)
+    with pytest.raises(ValueError, match="context_length of at least 9"):
+        error_ahead(policy, batch, 7)
+
+
+def test_divergences_are_those_of_torch():
+    torch.manual_seed(0)
+    p, q = torch.randn(2, 20, 4)
+    categorical = _divergence(p, q, Component("a", slice(0, 1), 4))
+    torch.testing.assert_close(categorical, kl_divergence(Categorical(logits=p), Categorical(logits=q)))
+    gaussian = _divergence(p, q, Component("a", slice(0, 2), None, gaussian=True))
+    normals = [Normal(x[:, :2], x[:, 2:].exp()) for x in (p, q)]
+    torch.testing.assert_close(gaussian, kl_divergence(*normals).sum(-1))
+    unit = _divergence(p, q, Component("a", slice(0, 4), None))
+    torch.testing.assert_close(unit, kl_divergence(Normal(p, 1.0), Normal(q, 1.0)).sum(-1))
+
+
+def test_directions_that_say_the_same_disagree_by_nothing(make, root):
+    policy = make()
+    batch = unseen_windows(policy, root, LAST)
+    assert disagreement(policy, batch, "behavior_cloning") > 0
+    for parameter in policy.network.heads["a"].parameters():
+        torch.nn.init.zeros_(parameter)
+    assert disagreement(policy, batch, "behavior_cloning") == 0
+
+
+def test_a_record_holds_what_applies(make, root):
+    assert set(measure(make(), root, LAST, ahead=3)) == {"windows", "episodes", "ahead", "disagreement_nats"}
+    assert "disagreement_nats" not in measure(make(attention="bidirectional"), root, LAST, ahead=3)
+    assert "ahead" not in measure(make(), root, LAST, ahead=7)
+    timed = latency(make(), calls=5)
+    assert 0 < timed["quartiles_ms"][0] <= timed["median_ms"] <= timed["quartiles_ms"][1]
+
+
+def test_the_ablation_command_in_short(root, tmp_path, capsys):
+    config = tmp_path / "short.yaml"
+    config.write_text(f"""
+name: short
+variants:
+  both: {{}}
+  plain: {{fine_inputs: false}}
+context_lengths: [4, 6]
+seeds: [0]
+steps: 2
+rollouts: 2
+episodes: {EPISODES}
+training_episodes: 2
+ahead: 2
+policy: {{device: cpu, width: 16, depth: 1, heads: 2, feedforward_width: 16, dropout: 0.0}}
+data: {root}
+output: {tmp_path / "out"}
+""")
+    main(["ablation", f"--config_path={config}"])
+    record = json.loads((tmp_path / "out" / "short.json").read_text())
+    assert [(run["row"], run["context_length"]) for run in record["runs"]] == [
+        ("both", 4), ("plain", 4), ("both", 6), ("plain", 6),
+    ]  # fmt: skip
+    for run in record["runs"]:
+        assert run["steps"] == 2
+        assert set(run["returns"]) == {"behavior_cloning", "reward_conditioned"}
+        cell = record["summary"][f"{run['row']}, K = {run['context_length']}"]
+        assert cell["error_ahead"]["mean"] == pytest.approx(run["ahead"]["model"])
+        assert cell["behavior_cloning"]["mean"] == pytest.approx(run["returns"]["behavior_cloning"]["mean_return"])
+    assert (tmp_path / "out" / "short.png").stat().st_size > 10_000
+    assert "| plain, K = 6 |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [("seeds: []", "at least one variant"), ("steps: 0", "at least 1"), ("rolouts: 3", "rolouts")],
+)
+def test_a_wrong_configuration_is_refused(tmp_path, capsys, line, message):
+    (tmp_path / "wrong.yaml").write_text(line + "\n")
+    with pytest.raises(SystemExit):
+        main(["ablation", f"--config_path={tmp_path / 'wrong.yaml'}"])
+    assert message in capsys.readouterr().err
