@@ -130,7 +130,7 @@ def add_label(
     Raises:
         FileNotFoundError: There is no dataset in `root`.
         FileExistsError: `output` exists and is not an empty folder; it is left as it was.
-        ValueError: The column exists, or the labels do not make one.
+        ValueError: The column exists, the labels do not make one, or `output` lies inside `root`.
     """
     root = Path(root).expanduser().resolve()
     info = _read_info(root)
@@ -139,6 +139,8 @@ def add_label(
     if name in info["features"]:
         raise ValueError(f"{root} has a column {name} already; choose another name.")
     target = root if output is None else refuse_existing(output)
+    if root in target.parents:
+        raise ValueError(f"output is {target}, a folder inside the dataset itself; choose one beside it.")
     column, lengths = _label_all(root, info, labeller, progress)
     feature, column = _feature(column, categories)
     partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")

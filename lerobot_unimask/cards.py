@@ -161,9 +161,9 @@ def _commands(policy: UniMASKPolicy, repo_id: str, train_config: Mapping[str, An
         dataset += f" --dataset.root={shlex.quote(str(data['root']))}"
     environment = (train_config.get("env") or {}).get("type") or _environment(data.get("root")) or "YOUR_ENVIRONMENT"
     weights = policy.training_masks.weights
-    question = "behavior_cloning" if set(weights) == {RANDOM_MASK} else next(iter(weights))
-    t = "" if question == RANDOM_MASK else _example(question, tuple(policy.factors), policy.config.context_length)[1]
-    at = "" if t in ("", None) else f" --t={t}"
+    question = next((text for text in weights if text != RANDOM_MASK), "behavior_cloning")
+    _, t = _example(question, tuple(policy.factors), policy.config.context_length)
+    at = "" if t is None else f" --t={t}"
     return (
         f"lerobot-eval --policy.path={repo_id} --env.type={environment} --eval.n_episodes=100 --eval.batch_size=50\n"
         f"unimask query --policy.path={repo_id} {dataset} --episode=0 --mask={shlex.quote(question)}{at}\n"

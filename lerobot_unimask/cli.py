@@ -272,6 +272,11 @@ def _question_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("dynamics", "agreement"),
         help="draw again what contradicts DoorKey's rules: step by step, or together with all that is shown",
     )
+    parser.add_argument(
+        "--exact",
+        choices=("paper", "released"),
+        help="DoorKey: set the exact optimum's marginals beside the model's, for data of this expert",
+    )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the answer, into a .png, .svg or .pdf")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
 
@@ -384,6 +389,7 @@ def _label(arguments: argparse.Namespace) -> None:
 def _query(arguments: argparse.Namespace) -> None:
     _check_query(arguments)
     from lerobot_unimask import query
+    from lerobot_unimask.experiments.validation import check_expert
 
     loaded = query.load_policy(arguments.path, arguments.revision)
     if arguments.mask is None:
@@ -391,22 +397,25 @@ def _query(arguments: argparse.Namespace) -> None:
         print(json.dumps(overview, indent=2) if arguments.json else query.describe_overview(overview))
         return
     batch = data = sampling = None
+    drawing = {}
     start = arguments.start or 0
     if arguments.episode is not None:
         repo_id = arguments.repo_id or "local/dataset"
         dataset = query.open_dataset(loaded.policy, arguments.root, repo_id)
         batch = query.read_window(dataset, arguments.episode, start)
+        drawing = {"maze": query.maze_of(dataset)}
+        check_expert(Path(dataset.root), arguments.exact)
         root = str(arguments.root) if arguments.root else None
         data = {"root": root, "repo_id": arguments.repo_id, "episode": arguments.episode, "start": start}
     if arguments.sample:
         sampling = query.Sampling(arguments.sample, arguments.order or "forward", arguments.seed or 0, arguments.check)
-    question = {"t": arguments.t, "given": arguments.given, "sampling": sampling}
+    question = {"t": arguments.t, "given": arguments.given, "sampling": sampling, "exact": arguments.exact}
     reply = query.ask(loaded.policy, arguments.mask, batch=batch, start=start, **question)
     result = query.record(loaded, arguments.mask, reply, data=data, **question)
     print(json.dumps(result, indent=2) if arguments.json else query.describe(result))
     if arguments.plot:
         arguments.plot.parent.mkdir(parents=True, exist_ok=True)
-        query.picture(loaded.policy, arguments.mask, reply).savefig(arguments.plot, dpi=200)
+        query.picture(loaded.policy, arguments.mask, reply, **drawing).savefig(arguments.plot, dpi=200)
         print(f"drawn into {arguments.plot}", file=sys.stderr if arguments.json else sys.stdout)
 
 
@@ -416,7 +425,7 @@ def _check_query(arguments: argparse.Namespace) -> None:
     Raises:
         ValueError: names the flag that is missing.
     """
-    needs_mask = ("t", "given", "episode", "sample", "plot")
+    needs_mask = ("t", "given", "episode", "sample", "exact", "plot")
     needs_sample, needs_data = ("order", "seed", "check"), arguments.root is None and arguments.repo_id is None
     for needed, flags, missing in (
         ("--mask", needs_mask, arguments.mask is None),
@@ -428,6 +437,8 @@ def _check_query(arguments: argparse.Namespace) -> None:
         if missing and given:
             flag = {"root": "dataset.root", "repo_id": "dataset.repo_id"}.get(given[0], given[0])
             raise ValueError(f"--{flag} is given without {needed}: give both or neither.")
+    if arguments.exact and arguments.sample:
+        raise ValueError("--exact answers with marginals, not samples: leave out --sample or --exact.")
     if arguments.plot is not None and arguments.plot.suffix not in (".png", ".svg", ".pdf"):
         raise ValueError(f"--plot={arguments.plot} is no picture's name: end it in .png, .svg or .pdf.")
 
@@ -442,12 +453,14 @@ def _print_given(arguments: argparse.Namespace) -> None:
 
 def _questions(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.experiments.questions import ask_everything, summary
-    from lerobot_unimask.experiments.validation import first_windows, training_settings
+    from lerobot_unimask.experiments.validation import first_windows, provenance_of, training_settings
     from lerobot_unimask.query import load_policy
 
     loaded = load_policy(arguments.path, arguments.revision)
     batch = first_windows(loaded.policy, arguments.root, arguments.repo_id)
-    record = ask_everything(loaded.policy, batch, each=arguments.each, samples=arguments.samples, seed=arguments.seed)
+    expert = (provenance_of(arguments.root) or {}).get("expert", "paper")
+    settings = {"each": arguments.each, "samples": arguments.samples, "seed": arguments.seed, "expert": expert}
+    record = ask_everything(loaded.policy, batch, **settings)
     record["policy"] = {"path": loaded.path, "revision": loaded.revision}
     record["training"] = training_settings(Path(loaded.path))
     record["command"] = arguments.text
@@ -465,14 +478,14 @@ def _gallery(arguments: argparse.Namespace) -> None:
 
     from lerobot_unimask.experiments.gallery import doorkey_pictures, maze_pictures, write_gallery
     from lerobot_unimask.experiments.validation import first_windows
-    from lerobot_unimask.query import load_policy, middle_windows, open_dataset
+    from lerobot_unimask.query import load_policy, maze_of, middle_windows, open_dataset
 
     policy = load_policy(arguments.path, arguments.revision).policy
     pictures = doorkey_pictures(policy, first_windows(policy, arguments.root, "local/dataset"))
     if arguments.maze_path is not None:
         maze = load_policy(arguments.maze_path).policy
-        windows = middle_windows(open_dataset(maze, arguments.maze_root, "local/dataset"))
-        pictures = chain(pictures, maze_pictures(maze, windows))
+        dataset = open_dataset(maze, arguments.maze_root, "local/dataset")
+        pictures = chain(pictures, maze_pictures(maze, middle_windows(dataset), walls=maze_of(dataset)))
     for path in write_gallery(pictures, arguments.output, command=arguments.text):
         print(path)
 

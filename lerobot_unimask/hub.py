@@ -7,6 +7,7 @@ import functools
 import hashlib
 import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -220,7 +221,7 @@ def push_policy(
         kind="model",
         private=private,
         message="Upload policy: weights, config, processors, train config and card",
-        again=f"unimask push --policy.path={saved or folder} --repo_id={repo_id}",
+        again=f"unimask push --policy.path={shlex.quote(str(saved or folder))} --repo_id={repo_id}",
     )
 
 
@@ -243,7 +244,7 @@ def push_dataset(root: Path, repo_id: str, *, private: bool | None = None) -> st
         kind="dataset",
         private=private,
         message="Upload dataset and card",
-        again=f"unimask push --dataset.root={root} --repo_id={repo_id}",
+        again=f"unimask push --dataset.root={shlex.quote(str(root))} --repo_id={repo_id}",
         tag=json.loads((root / "meta" / "info.json").read_text())["codebase_version"],
     )
 

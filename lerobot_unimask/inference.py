@@ -123,6 +123,10 @@ def answer(
     return Answer(mask, distributions)
 
 
+class RejectionError(ValueError):
+    """No sample passed the check in as many tries as it was given."""
+
+
 @dataclass
 class Samples(Window):
     """Drawn windows: shown and drawn values, NaN elsewhere; and what the check cost.
@@ -170,7 +174,8 @@ def sample(
             given up.
 
     Raises:
-        ValueError: an unknown order, or a check that what is shown, or every start of some sample, fails.
+        ValueError: an unknown order, or a check that what is shown fails.
+        RejectionError: one that every start of some sample fails.
     """
     if order not in ORDERS:
         raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
@@ -225,7 +230,7 @@ def sample(
         if len(rows) == 0:
             return samples
         samples.restarted += len(rows)
-    raise ValueError(
+    raise RejectionError(
         f"{len(rows)} of {len(window.valid)} samples did not pass the check, each started {tries} times; it rejected "
         f"{samples.rejected} of {samples.drawn} drawn tokens. The model finds what is shown hard to reconcile with it: "
         "show something likelier, draw in another order, or raise tries."

@@ -236,7 +236,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             MaskError: the question does not fit the model, or not this t.
             ValueError: a shown token is neither recorded nor given, or a given value is not a legal one.
         """
-        window, mask = self._pose(window, mask, t, given)
+        window, mask = self.pose(window, mask, t, given)
         with _evaluation(self):
             return inference.answer(self.predict, self.statistics, self.factors, window, mask)
 
@@ -270,7 +270,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         Raises:
             ValueError: also where the check cannot be met.
         """
-        window, mask = self._pose(window, mask, t, given)
+        window, mask = self.pose(window, mask, t, given)
         window, mask = window.repeat(samples), mask.repeat(samples)
         generator = torch.Generator(self.device).manual_seed(seed)
         with _evaluation(self):
@@ -286,10 +286,11 @@ class UniMASKPolicy(PreTrainedPolicy):
                 tries=tries,
             )
 
-    def _pose(
+    def pose(
         self, window: Window | Mapping[str, Tensor] | None, mask: Mask | str, t: int | None, given: Given | None
     ) -> tuple[Window, Mask]:
-        """The window and mask of a question, on the policy's device, with nothing shown that is not known."""
+        """The window and mask of a question, on the policy's device, with nothing shown that is not known; arguments
+        and errors are those of `infer`."""
         K = self.config.context_length
         recorded = window is not None
         if window is None:
@@ -478,7 +479,13 @@ class UniMASKPolicy(PreTrainedPolicy):
             names = ("force_download", "token", "cache_dir", "local_files_only")
             download = {name: kwargs.pop(name) for name in names if name in kwargs}
             folder = hub.fetch(str(pretrained_name_or_path), revision=revision, **download)
-        policy = super().from_pretrained(folder, config=config or _read_config(folder), **kwargs)
+        config = config or _read_config(folder)
+        saved = folder / CONFIG_NAME
+        if saved.exists() and "attention" not in json.loads(saved.read_text()):  # it has learnt nothing causally
+            raise ValueError(
+                f'{saved} is of a version without attention in one direction: add "attention": "bidirectional" to it.'
+            )
+        policy = super().from_pretrained(folder, config=config, **kwargs)
         policy._read_dataset(dataset_stats, dataset_meta)
         policy.origin = hub.Origin(str(pretrained_name_or_path), hub.commit_of(folder))
         return policy

@@ -24,8 +24,9 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from lerobot_unimask import hub, plots
-from lerobot_unimask.envs.doorkey import DynamicsCheck
-from lerobot_unimask.experiments.validation import checkpoints_of
+from lerobot_unimask.envs.doorkey import DynamicsCheck, Expert
+from lerobot_unimask.experiments.optimum import check_features, exact_answer
+from lerobot_unimask.experiments.validation import checkpoints_of, provenance_of
 from lerobot_unimask.inference import Answer, Check, Given, Samples
 from lerobot_unimask.masks import ASKABLE, TASKS, Mask, MaskError, parse_token, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
@@ -102,6 +103,11 @@ def read_window(dataset: LeRobotDataset, episode: int, start: int = 0) -> dict[s
     return default_collate([dataset[first + start]])
 
 
+def maze_of(dataset: LeRobotDataset) -> str:
+    """The maze, a name or text, that a Maze2D dataset was built in."""
+    return (provenance_of(Path(dataset.root)) or {}).get("maze", "medium")
+
+
 def middle_windows(dataset: LeRobotDataset, most: int = 200) -> dict[str, Tensor]:
     """The windows in the middle of the first episodes, as a LeRobot batch."""
     episodes = dataset.meta.episodes
@@ -166,11 +172,13 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a question: marginals, or samples where those were asked for; and what was recorded."""
+    """What came of a question: marginals, or samples where those were asked for; what was recorded; and DoorKey's exact
+    marginals, where those were asked for too."""
 
     mask: Mask
     answer: Answer | Samples
     recorded: Window | None
+    exact: Answer | None = None
 
 
 def ask(
@@ -182,15 +190,18 @@ def ask(
     given: Given | None = None,
     sampling: Sampling | None = None,
     start: int = 0,
+    exact: Expert | None = None,
 ) -> Reply:
     """Put one question to a policy.
 
     Args:
         batch: one recorded window, as `read_window` gives it; None where everything shown is in `given`.
-        start: the episode's step that the window begins at, of which a check may know.
+        start: the episode's step that the window begins at, of which a check and the optimum know.
+        exact: DoorKey's expert whose data it is, to put the question to the exact optimum too.
 
     Raises:
-        MaskError, ValueError: as `UniMASKPolicy.infer` and `sample`; or values are given for several windows.
+        MaskError, ValueError: as `UniMASKPolicy.infer` and `sample`; values are given for several windows; or the
+            optimum is of another environment, or finds what is shown impossible.
     """
     recorded = None if batch is None else policy.make_window(batch, partial=True)
     question = tabulate(mask, tuple(policy.factors), policy.config.context_length).at(t)
@@ -219,7 +230,13 @@ def ask(
         windows = len(answer.valid) // sampling.samples
     if windows > 1:
         raise ValueError(f"Values for {windows} windows are given; give one value for each token.")
-    return Reply(posed, answer, recorded)
+    best = None
+    if exact is not None:
+        check_features(policy.config.features)
+        window, shown = policy.pose(recorded, mask, t, given)
+        cpu = torch.device("cpu")
+        best = exact_answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
+    return Reply(posed, answer, recorded, best)
 
 
 def make_check(policy: UniMASKPolicy, name: str | None, start: int = 0) -> Check | None:
@@ -242,7 +259,7 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
 
     Marginals have `most_likely`, its `probability` and all `probabilities`, or `mean` and `scale` (None from an L2
     head); samples `most_frequent`, its `share` and all `shares`, or `mean` and `scale` over the samples. `recorded` is
-    None where nothing is.
+    None where nothing is. `exact` has the optimum's marginal, where that was asked for.
     """
     K = policy.config.context_length
     table = []
@@ -260,7 +277,8 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
                     else:
                         said = _of_marginals(reply.answer, name, step, i)
                     row = {"token": f"{name}[{step}]", "step": step, "component": _labels(policy)[name][i]}
-                    table.append({**row, **said, "recorded": recorded})
+                    best = {} if reply.exact is None else {"exact": _of_marginals(reply.exact, name, step, i)}
+                    table.append({**row, **said, **best, "recorded": recorded})
     return table
 
 
@@ -309,6 +327,7 @@ def record(
     given: Given | None,
     data: Mapping[str, Any] | None,
     sampling: Sampling | None,
+    exact: Expert | None = None,
 ) -> dict[str, Any]:
     """Everything that decides an answer, and the answer, for a JSON.
 
@@ -321,6 +340,7 @@ def record(
         "t": t,
         "given": dict(given or {}),
         "data": dict(data) if data is not None else None,
+        "exact": exact,
         "drawing": reply.mask.draw(),
         "answers": rows(loaded.policy, reply),
     }
@@ -347,6 +367,8 @@ def describe(result: Mapping[str, Any]) -> str:
     if result["data"] is not None:
         data = result["data"]
         lines.append(f"  episode {data['episode']} of {data['root'] or data['repo_id']}, from step {data['start']} on")
+    if result["exact"]:
+        lines.append(f"  exact: the optimum's answer, for data of the expert {result['exact']!r}")
     sampled = result.get("sampling")
     if sampled:
         lines.append(
@@ -363,14 +385,16 @@ def _cells(answers: Sequence[Mapping[str, Any]], sampled: bool) -> Iterator[list
     value, weight = ("most frequent", "share") if sampled else ("most likely", "probability")
     heads = [value if discrete else "", "mean" if continuous else ""]
     weights = [weight if discrete else "", "scale" if continuous else ""]
-    yield ["step", "component", " / ".join(filter(None, heads)), " / ".join(filter(None, weights)), "recorded"]
+    best = ["exact", "probability"] if "exact" in answers[0] else []
+    yield ["step", "component", " / ".join(filter(None, heads)), " / ".join(filter(None, weights)), *best, "recorded"]
     for row in answers:
         recorded = "" if row["recorded"] is None else f"{row['recorded']:.4g}"
         if "mean" in row:
             said = [f"{row['mean']:.4g}", "" if row["scale"] is None else f"± {row['scale']:.3g}"]
         else:
             said = [str(row[value.replace(" ", "_")]), f"{row[weight]:.3f}"]
-        yield [str(row["step"]), row["component"], *said, recorded]
+        best = [str(row["exact"]["most_likely"]), f"{row['exact']['probability']:.3f}"] if "exact" in row else []
+        yield [str(row["step"]), row["component"], *said, *best, recorded]
 
 
 def _align(cells: Sequence[Sequence[str]]) -> list[str]:
@@ -451,8 +475,12 @@ def describe_overview(result: Mapping[str, Any]) -> str:
 # --- Pictures ---------------------------------------------------------------------------------------------------------
 
 
-def picture(policy: UniMASKPolicy, mask: str, reply: Reply) -> Figure:
-    """The picture that suits the environment and the answer; of any other model, its marginals or distributions."""
+def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, maze: str = "medium") -> Figure:
+    """The picture that suits the environment and the answer; of any other model, its marginals or distributions.
+
+    Args:
+        maze: Maze2D's, see `maze_of`.
+    """
     states = _labels(policy)["s"]
     every_state = bool((reply.mask.visible["s"] | reply.mask.predict["s"]).all())
     if isinstance(reply.answer, Samples):
@@ -465,7 +493,7 @@ def picture(policy: UniMASKPolicy, mask: str, reply: Reply) -> Figure:
     if states == DOORKEY and every_state:
         return plots.state_distributions(reply.answer)
     if states == MAZE2D and reply.mask.predict["s"].any():
-        return plots.maze_trajectories(reply.answer, reply.recorded)
+        return plots.maze_trajectories(reply.answer, reply.recorded, maze=maze)
     return plots.marginals(reply.answer, reply.recorded)
 
 

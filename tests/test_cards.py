@@ -39,6 +39,13 @@ def test_a_policy_s_card_draws_the_questions_it_was_trained_on(tiny_policy) -> N
     assert "Context length: 10 steps." in body
     assert "lerobot-train x" in body
     assert "lerobot-eval --policy.path=me/policy --env.type=doorkey" in body
+    assert "--episode=0 --mask=goal_conditioned --t=5\n" in body
+
+
+@pytest.mark.parametrize("masks", [["random_mask", "past"], "random_mask"])
+def test_the_question_to_try_is_one_that_can_be_asked(tiny_policy, masks) -> None:
+    body = read(cards.policy_card(tiny_policy(training_masks=masks), "me/policy"))[1]
+    assert f"--mask={'past' if len(masks) == 2 else 'behavior_cloning'} --t=" in body
 
 
 def test_a_policy_s_card_says_which_data(tiny_policy) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hub_server import Hub
 
-from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 
 FLOW = Path(__file__).with_name("hub_flow.py")
 
@@ -124,6 +124,18 @@ def test_lerobot_eval_refuses_it_too(
     while causes[-1].__cause__ is not None:
         causes.append(causes[-1].__cause__)
     assert words in capsys.readouterr().err + "".join(map(str, causes))
+
+
+def test_a_checkpoint_from_before_causal_attention_does_not_act_causally(checkpoint: Path) -> None:
+    path = checkpoint / "config.json"
+    settings = json.loads(path.read_text())
+    del settings["attention"]
+    path.write_text(json.dumps(settings))
+    for config in (None, UniMASKConfig(device="cpu")):
+        with pytest.raises(ValueError, match='add "attention": "bidirectional" to it'):
+            UniMASKPolicy.from_pretrained(checkpoint, config=config)
+    change(checkpoint, attention="bidirectional")
+    assert UniMASKPolicy.from_pretrained(checkpoint).config.attention == "bidirectional"
 
 
 def test_weights_cut_short_end_in_one_error(checkpoint: Path) -> None:

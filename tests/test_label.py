@@ -215,6 +215,13 @@ def test_bad_labels_are_refused(label, expected, root):
     assert files(root) == before
 
 
+def test_a_dataset_does_not_go_into_itself(root, refused):
+    before = files(root)
+    flags = (f"--dataset.root={root}", f"--output={root / 'data' / 'new'}", f"--name={CORNER}")
+    assert "a folder inside the dataset itself" in refused(*flags, "--visits=agent_cell=0")
+    assert files(root) == before
+
+
 @pytest.mark.parametrize("output", [None, "new"])
 @pytest.mark.parametrize("moment", ["_label_all", "_write_data", "_write_meta", "_put_in_place"])
 def test_an_interruption_leaves_nothing_half_written(moment, output, root, monkeypatch):

@@ -131,7 +131,12 @@ output: {tmp_path / "out"}
 
 @pytest.mark.parametrize(
     ("line", "message"),
-    [("seeds: []", "at least one variant"), ("steps: 0", "at least 1"), ("rolouts: 3", "rolouts")],
+    [
+        ("seeds: []", "at least one variant"),
+        ("variants: {a/b: {}}", "leave '/' out"),
+        ("steps: 0", "at least 1"),
+        ("rolouts: 3", "rolouts"),
+    ],
 )
 def test_a_wrong_configuration_is_refused(tmp_path, capsys, line, message):
     (tmp_path / "wrong.yaml").write_text(line + "\n")

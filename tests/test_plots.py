@@ -87,7 +87,8 @@ def test_five_panels_name_their_questions_and_what_came_of_them(policy, tmp_path
         ),
         ({"s[3]": [5, 5]}, {"return": [2.0], "success": [True], "s[3] reached": [True]}, "s[3] reached, returned 2"),
         ({"rtg[0]": 2.0}, {"return": [3.0], "success": [False]}, "asked for 2, returned 3"),
-        ({}, {"samples": 100, "possible": 43, "impossible_steps": [0]}, "43 of 100 samples possible"),
+        ({}, {"possible histories": 3, "tokens drawn": 57, "rejected": 3}, "3 possible histories"),
+        ({}, {"possible histories": 0}, "no possible history found"),
     ],
 )
 def test_the_line_below_a_grid_says_what_came_of_the_question(given, achieved, line):

@@ -1,13 +1,18 @@
 """`unimask query`: its table and JSON are the policy's answers, and whoever mistypes is told what would have worked."""
 
 import json
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from lerobot_unimask import cli, hub, query
-from lerobot_unimask.envs.doorkey import DynamicsCheck
+from lerobot_unimask.envs.doorkey import DynamicsCheck, expert_probabilities
+from lerobot_unimask.envs.maze2d import parse_maze
+from lerobot_unimask.experiments.optimum import exact_answer
+from lerobot_unimask.masks import tabulate
 from lerobot_unimask.query import Sampling
 
 MASK = "s[1:4], a[:2] | s[0], s[4]"
@@ -102,6 +107,50 @@ def test_a_window_may_start_later_and_what_lies_past_the_end_is_not_asked(ask, t
     assert result["answers"][-1]["probabilities"] == pytest.approx(expected.tolist())
 
 
+def test_the_exact_optimum_answers_the_same_question(ask, tiny_policy, doorkey):
+    question = "s[1:], a[:] | s[0]"
+    flags = (f"--mask={question}", "--start=6", '--given={"s[0]": [12, 12]}', "--exact=paper")
+    result = json.loads(ask(*flags, "--json", episode=2))
+    assert result["exact"] == "paper"
+    window = tiny_policy().make_window(query.read_window(doorkey, 2, 6))
+    window.values["s"][0, 0] = 12
+    mask = tabulate(question, tuple(window.values), 10).at(None).within(window.valid)
+    exact = exact_answer(window, mask, first_step=6)
+    for row in result["answers"]:
+        name, i = row["token"][0], ["agent_cell", "key_cell", "direction"].index(row["component"]) % 2
+        probabilities = exact[name][i].probabilities[0, row["step"]]
+        assert row["exact"]["probabilities"] == pytest.approx(probabilities.tolist())
+        assert row["exact"]["probability"] == pytest.approx(probabilities.max().item())
+    said = ask(*flags, episode=2)
+    assert "for data of the expert 'paper'" in said
+    table = said[said.index("step  component") :].splitlines()
+    assert " ".join(table[0].split()) == "step component most likely probability exact probability recorded"
+    assert table[1].split()[4:6] == [
+        str(result["answers"][0]["exact"]["most_likely"]),
+        f"{result['answers'][0]['exact']['probability']:.3f}",
+    ]
+    assert "exact" not in json.loads(ask("--mask=s[1] | s[0]", "--json", episode=2))["answers"][0]
+
+
+def test_the_optimum_is_that_of_the_expert_that_is_named(tiny_policy):
+    """Up is a bump from there, which the two count differently."""
+    given = {"s[0]": [0, 5]}
+    up = {
+        expert: query.ask(tiny_policy(), "a[0] | s[0]", given=given, exact=expert).exact["a"][0].probabilities[0, 0, 3]
+        for expert in ("paper", "released")
+    }
+    for expert, probability in up.items():
+        expected = expert_probabilities(np.array(0), np.array(5), np.array(False), expert=expert)[3]
+        assert probability.item() == pytest.approx(expected)
+    assert up["paper"] != pytest.approx(up["released"].item(), abs=0.01)
+
+
+def test_only_doorkey_has_an_exact_optimum(tiny_policy, continuous_batch):
+    batch = {key: value[:1] for key, value in continuous_batch.items()}
+    with pytest.raises(ValueError, match="Only DoorKey's"):
+        query.ask(tiny_policy("continuous"), "s[1] | s[0]", batch=batch, exact="paper")
+
+
 def test_samples_follow_the_policy_and_count_what_was_rejected(ask, tiny_policy, doorkey):
     flags = ("--mask=a[:3] | s[:4]", "--sample=50", "--order=backward", "--seed=4", "--check=dynamics")
     result = json.loads(ask(*flags, "--json", episode=0))
@@ -185,6 +234,24 @@ def test_every_answer_can_be_drawn(flags, ask, tmp_path):
     assert Image.open(picture).width > 400
 
 
+def test_a_maze_is_drawn_with_the_walls_of_its_data(tiny_policy, tmp_path):
+    data = SimpleNamespace(root=tmp_path)
+    assert query.maze_of(data) == "medium"
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "provenance.json").write_text('{"maze": "umaze"}')
+    names = ["x", "y", "goal_x", "goal_y"]
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (4,), "names": names},
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    numbers = {"observation.state": 4, "action": 2}
+    stats = {key: {"mean": [0.0] * size, "std": [1.0] * size} for key, size in numbers.items()}
+    policy = tiny_policy("continuous", features=features, stats=stats)
+    reply = query.ask(policy, "s[1:] | s[0]", given={"s[0]": [1, 1, 2, 2]})
+    drawn = query.picture(policy, "s[1:] | s[0]", reply, maze=query.maze_of(data))
+    assert len(drawn.axes[0].patches) == "".join(parse_maze("umaze").rows).count("#")
+
+
 def test_with_json_only_the_json_is_printed(ask, tmp_path):
     json.loads(ask("--mask=s[1] | s[0]", "--json", f"--plot={tmp_path / 'a.png'}", episode=1))
 
@@ -237,6 +304,10 @@ def test_a_policy_of_the_hub_is_named_with_its_commit(tiny_policy, tmp_path, mon
         (["--mask=s[1] | s[0]", "--episode=1"], "--episode is given without --dataset.root=DIR"),
         (["--mask=s[1] | s[0]", "--order=forward"], "--order is given without --sample=N"),
         (["--t=1"], "--t is given without --mask"),
+        (["--exact=paper"], "--exact is given without --mask"),
+        (["--mask=s[1] | s[0]", "{data}", "--episode=1", "--exact=released"], "data of the expert 'paper'"),
+        (["--mask=s[1] | s[0]", "--sample=2", "--exact=paper"], "leave out --sample or --exact"),
+        (["--mask=s[1] | s[0]", '--given={"s[0]": [2, 0]}', "--exact=paper"], "cannot occur together in DoorKey"),
         (["--mask=s[1] | s[0]", "--dataset.root=nowhere", "--episode=1"], "nowhere holds no LeRobotDataset"),
         (["--mask=s[1] | s[0]", "{data}", "--episode=1", "--plot=answer.doc"], "--plot=answer.doc"),
     ],

@@ -124,7 +124,9 @@ def shortened(words: list[str]) -> list[str]:
     overrides: dict[str, Any] = {}
     for name, value, when in SHORT.get(script, []):
         given = flags.get(f"--{name}")
-        if when == "always" or (given is not None and int(given) > value):
+        if given is not None and ":" in given:  # a range of episodes, the last of a dataset
+            overrides[name] = f"{value - 4}:{value}"
+        elif when == "always" or (given is not None and int(given) > value):
             overrides[name] = value
     if script == "lerobot-train":
         overrides |= _short_training(flags)
@@ -292,6 +294,7 @@ def test_blocks_and_commands_are_found_with_their_lines() -> None:
     [
         ("unimask build doorkey --episodes=500 --root=d", "unimask build doorkey --root=d --episodes=40"),
         ("unimask build doorkey --root=d", "unimask build doorkey --root=d"),
+        ("unimask measure --episodes=900:1000", "unimask measure --episodes=36:40"),
         (
             "lerobot-eval --policy.path=o/checkpoints/004000/pretrained_model --eval.n_episodes=100",
             "lerobot-eval --policy.path=o/checkpoints/last/pretrained_model --eval.n_episodes=2 --eval.batch_size=2",

@@ -48,6 +48,16 @@ def test_each_run_is_done_once_and_never_again(tmp_path, capsys):
     assert set(states_of(tmp_path)) == {key(run) for run in RUNS[:5]}
 
 
+def test_runs_of_other_settings_are_not_mixed_with_those_that_are_done(tmp_path):
+    do = partial(run_study, "test", execute=partial(sleep, 0), output=tmp_path)
+    done = do(runs=RUNS[:1], settings={"steps": 10, "variants.a": {"width": 16}})
+    with pytest.raises(ValueError, match=r"holds runs with steps=10, and now it is 20: choose another name and output"):
+        do(runs=RUNS[:1], settings={"steps": 20})
+    assert do(runs=RUNS[:2], settings={"steps": 10, "variants.b": {}})[0] == done[0]  # the grid has grown
+    with pytest.raises(ValueError, match=r"variants.a"):
+        do(runs=RUNS[:1], settings={"steps": 10, "variants.a": {"width": 32}})
+
+
 def test_a_run_that_fails_ends_the_study_and_is_tried_again_by_the_next(tmp_path):
     def fail(run: dict) -> dict:
         if run["seed"] == 1:

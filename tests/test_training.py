@@ -59,5 +59,5 @@ def test_its_losses_are_those_of_lerobot_train(doorkey_root, tmp_path, losses, m
 def test_what_is_not_there_is_named(doorkey_root, tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
         Trainer(SMALL, tmp_path, seed=0, steps=1, batch_size=8)
-    with pytest.raises(TypeError, match="flavour"):
+    with pytest.raises(ValueError, match="flavour"):
         Trainer(SMALL | {"flavour": 1}, doorkey_root, seed=0, steps=1, batch_size=8)

@@ -52,6 +52,8 @@ class AblationConfig:
     def __post_init__(self) -> None:
         if not self.variants or not self.context_lengths or not self.seeds:
             raise ValueError("An ablation needs at least one variant, context length and seed.")
+        if any("/" in name for name in self.variants):
+            raise ValueError("A variant gives its files their names: leave '/' out of it.")
         if min(self.steps, self.rollouts, self.training_episodes) < 1 or self.training_episodes >= self.episodes:
             raise ValueError("steps and rollouts are at least 1, training_episodes too and fewer than episodes.")
 
@@ -72,9 +74,11 @@ def ablation(config: AblationConfig, *, storage: str | None = None, workers: int
         for variant in config.variants
     ]
     output = Path(config.output)
-    records = run_study(
-        config.name, runs, partial(execute, config), output=output, storage=storage, workers=workers, **study
-    )
+    axes = ("name", "variants", "context_lengths", "seeds", "output")
+    settings = {name: value for name, value in asdict(config).items() if name not in axes}
+    settings |= {f"variants.{name}": variant for name, variant in config.variants.items()}
+    do = partial(run_study, config.name, runs, partial(execute, config), output=output, settings=settings)
+    records = do(storage=storage, workers=workers, **study)
     record = {
         "what": "return of LeRobot's evaluation, most likely actions; error of the predicted state some steps ahead",
         "config": asdict(config),

@@ -114,6 +114,8 @@ def _train(output: Path, data: Path, steps: int) -> Path:
         "--policy.type=unimask",
         "--policy.push_to_hub=false",
         f"--policy.training_masks={json.dumps(MASKS)}",
+        "--policy.attention=bidirectional",  # the paper's network: half as many tokens, so twice the updates in time
+        "--policy.token_layout=stacked",
         "--policy.depth=2",
         "--policy.dropout=0",
         "--dataset.repo_id=local/doorkey",

@@ -129,11 +129,12 @@ def _property(policy: UniMASKPolicy) -> Picture:
     return Picture("property", "A property", text, figure)
 
 
-def maze_pictures(policy: UniMASKPolicy, batch: dict[str, torch.Tensor]) -> Iterator[Picture]:
+def maze_pictures(policy: UniMASKPolicy, batch: dict[str, torch.Tensor], *, walls: str = "medium") -> Iterator[Picture]:
     """The pictures of a Maze2D policy: the way through a window, its ends and middle shown.
 
     Args:
         batch: recorded windows, of which the one with the longest way is drawn.
+        walls: the maze's name or text.
     """
     way = (batch[STATE][:, -1, :2] - batch[STATE][:, 0, :2]).norm(dim=-1)
     chosen = int(way.argmax())
@@ -144,7 +145,7 @@ def maze_pictures(policy: UniMASKPolicy, batch: dict[str, torch.Tensor]) -> Iter
         "maze2d",
         "Maze2D, with uncertainty",
         f"`{text}`, a recorded episode: the mass's position, shown twice; what lies between and what follows is asked.",
-        plots.maze_trajectories(policy.infer(window, text), window),
+        plots.maze_trajectories(policy.infer(window, text), window, maze=walls),
     )
 
 

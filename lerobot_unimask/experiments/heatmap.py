@@ -112,7 +112,9 @@ def heatmap(config: HeatmapConfig, *, storage: str | None = None, workers: int =
         for task in (TASKS if FINETUNE in config.rows else ())
     ]
     output = Path(config.output)
-    share = partial(run_study, config.name, output=output, storage=storage, workers=workers, **study)
+    axes = ("name", "rows", "episodes", "seeds", "output")
+    settings = {name: value for name, value in asdict(config).items() if name not in axes}
+    share = partial(run_study, config.name, output=output, settings=settings, storage=storage, workers=workers, **study)
     records = share(runs=first, execute=partial(execute, config))
     if second:  # needs the first ones' weights
         records += share(runs=second, execute=partial(execute, config))

@@ -17,7 +17,7 @@ from torch.utils.data import default_collate
 
 from lerobot_unimask.masks import Mask
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.window import Component
+from lerobot_unimask.window import RETURN_SO_FAR, Component
 
 EVERY = 7  # steps between the windows that are read
 
@@ -105,7 +105,7 @@ def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> d
     times = []
     for call in range(calls + policy.config.context_length):
         state = mean.expand(environments, -1).clone()
-        batch: dict[str, Any] = {}
+        batch: dict[str, Any] = {RETURN_SO_FAR: torch.zeros(environments, 1)}
         start = 0
         for feature in policy.config.features["s"]:
             batch[feature.key] = (

@@ -14,6 +14,7 @@ Legend of shapes: B windows, K steps, S states, A actions, C distances of the fi
 """
 
 import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -177,6 +178,19 @@ class Optimum:
         """Move the mass of each state and action, (..., S, A), to the states that follow, (..., S)."""
         after = moves.new_zeros(moves.shape[:-1])
         return after.index_add_(-1, self.following.flatten(), moves.flatten(-2))
+
+
+def check_features(features: Mapping[str, Sequence[Feature]]) -> None:
+    """The optimum can stand beside a model of DoorKey's states, actions and return alone.
+
+    Raises:
+        ValueError: the model's features are others.
+    """
+    if any(columns != FEATURES.get(name) for name, columns in features.items()):
+        raise ValueError(
+            "Only DoorKey's states, actions and return have an exact optimum; this model's features are "
+            f"{', '.join(feature.key for columns in features.values() for feature in columns)}."
+        )
 
 
 def exact_answer(window: Window, mask: Mask, *, expert: Expert = "paper", first_step: int = 0) -> Answer:

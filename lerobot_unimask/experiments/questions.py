@@ -285,7 +285,13 @@ def consistency(policy: UniMASKPolicy, batch: dict[str, Tensor], *, seed: int) -
 
 
 def ask_everything(
-    policy: UniMASKPolicy, batch: dict[str, Tensor], *, each: int = 10, samples: int = 4000, seed: int = 0
+    policy: UniMASKPolicy,
+    batch: dict[str, Tensor],
+    *,
+    each: int = 10,
+    samples: int = 4000,
+    seed: int = 0,
+    expert: Expert = "paper",
 ) -> dict[str, Any]:
     """Every measurement as one JSON record; returns and the property where the model has them.
 
@@ -293,6 +299,7 @@ def ask_everything(
         batch: first windows of unseen episodes.
         each: a tenth of the imitation's and the property's rollouts from each start; all of those for a goal or return.
         samples: in each order.
+        expert: whose data it is, to stand beside the policy and to choose the goals and returns.
 
     Raises:
         ValueError: the policy is not one of whole DoorKey episodes.
@@ -304,12 +311,13 @@ def ask_everything(
             f"its context_length is {policy.config.context_length}."
         )
     began = time.monotonic()
-    outcomes = expert_outcomes()
+    outcomes = expert_outcomes(expert=expert)
     imitation = play(policy, START_PAIRS.repeat(10 * each, axis=0), IMITATION, {}, seed=seed)
     record: dict[str, Any] = {
         "what": "sampled rollouts under questions, joint samples and random masks, of one DoorKey policy",
         "updates": int(policy.updates),
         "seed": seed,
+        "expert": expert,
         "imitation": {
             "rollouts": len(imitation.returns),
             "mean_return": imitation.returns.mean(),

@@ -9,12 +9,13 @@ storage is an SQLite file, for one machine, or any database that Optuna supports
 import fcntl
 import json
 import logging
+import math
 import multiprocessing
 import os
 import platform
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
@@ -69,6 +70,7 @@ def run_study(
     execute: Execute,
     *,
     output: Path,
+    settings: Mapping[str, Any] | None = None,
     storage: str | None = None,
     workers: int = 1,
     heartbeat: int = HEARTBEAT,
@@ -79,6 +81,7 @@ def run_study(
         name: the study's; runs of the same study are shared.
         execute: does one run. With several workers it must be picklable.
         output: folder; each record goes to `output/runs/KEY.json`.
+        settings: all else that the records depend on, JSON values; kept in `output/settings.json`.
         storage: a database's URL; None: `sqlite:///OUTPUT/study.db`.
         workers: processes to start here; with 1 this process works itself.
         heartbeat: seconds.
@@ -87,9 +90,11 @@ def run_study(
         The records, in the order of `runs`.
 
     Raises:
-        RuntimeError: some runs were not finished; the same call goes on with them.
+        ValueError: the folder holds runs of other settings.
+        ChildProcessError: some runs were not finished; the same call goes on with them.
     """
     (output / "runs").mkdir(parents=True, exist_ok=True)
+    _keep_settings(output, settings or {})
     storage = storage or f"sqlite:///{(output / 'study.db').resolve()}"
     study = _open(name, storage, heartbeat)
     known = {
@@ -111,11 +116,32 @@ def run_study(
     done = {key_of(trial): trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.COMPLETE}
     missing = [key(run) for run in runs if key(run) not in done]
     if missing:
-        raise RuntimeError(
+        raise ChildProcessError(
             f"{len(missing)} of {len(runs)} runs were not finished: {', '.join(missing[:5])}. "
             "The same command goes on with them."
         )
     return [done[key(run)].user_attrs["record"] for run in runs]
+
+
+def _keep_settings(output: Path, settings: Mapping[str, Any]) -> None:
+    """Runs are known by their names alone, so what is done once must not be mixed with what other settings give."""
+    path = output / "settings.json"
+    kept = json.loads(path.read_text()) if path.exists() else {}
+    settings = json.loads(json.dumps(settings))  # as they will be read
+    for name, value in settings.items():
+        if kept.get(name, value) != value:
+            raise ValueError(
+                f"{output} holds runs with {name}={json.dumps(kept[name])}, and now it is {json.dumps(value)}: choose "
+                "another name and output."
+            )
+    _write(path, {**kept, **settings})
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    """At once: a file is there in full or not at all."""
+    partial = path.with_suffix(f".{os.getpid()}")
+    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.replace(path)
 
 
 def work(name: str, storage: str, execute: Execute, output: Path, heartbeat: int) -> None:
@@ -153,12 +179,10 @@ def _objective(trial: optuna.Trial, study: optuna.Study, execute: Execute, outpu
         began = time.monotonic()
         record = execute(run)
         record = {**run, **record, "wall_seconds": round(time.monotonic() - began, 1), "versions": versions()}
-        partial = path.with_suffix(f".{os.getpid()}")
-        partial.write_text(json.dumps(record, indent=2) + "\n")
-        partial.replace(path)  # at once: a record is there in full or not at all
+        _write(path, record)
     trial.set_user_attr("record", record)
     print(_progress(study, trial, record), flush=True)
-    return record["loss"]
+    return math.inf if math.isnan(record["loss"]) else record["loss"]  # Optuna would count it as a failure
 
 
 def _progress(study: optuna.Study, trial: optuna.Trial, record: dict[str, Any]) -> str:

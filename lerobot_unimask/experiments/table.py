@@ -103,7 +103,9 @@ def table(config: TableConfig, *, storage: str | None = None, workers: int = 1, 
         ]
 
     output = Path(config.output)
-    do = partial(run_study, config.name, execute=partial(execute, config), output=output)
+    axes = ("name", "rows", "context_lengths", "seeds", "output")
+    settings = {name: value for name, value in asdict(config).items() if name not in axes}
+    do = partial(run_study, config.name, execute=partial(execute, config), output=output, settings=settings)
     share = partial(do, storage=storage, workers=workers, **study)
     records = share(runs=runs([row for row in config.rows if row in ROWS]))
     tuned = runs([row for row in config.rows if row in FINETUNED])

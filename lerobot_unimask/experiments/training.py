@@ -5,6 +5,7 @@ batches; a test holds the two to the same losses. No checkpoints, logs or evalua
 between updates.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ class Trainer:
 
     Raises:
         FileNotFoundError: there is no dataset in `root`.
-        TypeError: a setting that the policy does not have.
+        ValueError: a setting that the policy does not have, or one out of its range.
     """
 
     def __init__(
@@ -52,6 +53,9 @@ class Trainer:
     ):
         if not (root / "meta" / "info.json").exists():
             raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
+        unknown = sorted(settings.keys() - {field.name for field in dataclasses.fields(UniMASKConfig)})
+        if unknown:
+            raise ValueError(f"The policy has no setting {unknown[0]!r}; UniMASKConfig says which there are.")
         repo_id = "local/dataset"
         meta = LeRobotDatasetMetadata(repo_id, root=root)
         if checkpoint is None:
@@ -59,8 +63,6 @@ class Trainer:
         else:
             config = PreTrainedConfig.from_pretrained(checkpoint)
             for name, value in settings.items():
-                if not hasattr(config, name):
-                    raise TypeError(f"unimask has no setting {name!r}.")
                 setattr(config, name, value)
             config.pretrained_path = checkpoint
         set_seed(seed)

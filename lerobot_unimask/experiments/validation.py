@@ -23,8 +23,8 @@ from torch.utils.data import default_collate
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.envs.doorkey import Expert
 from lerobot_unimask.experiments.optimum import (
-    FEATURES,
     Optimum,
+    check_features,
     divergences,
     entropies,
     mean_over_asked,
@@ -109,9 +109,7 @@ def beside_optimum(
     Raises:
         ValueError: the policies' features are not DoorKey's.
     """
-    features = policies[0].config.features
-    if any(columns != FEATURES.get(name) for name, columns in features.items()):
-        raise ValueError(f"Only DoorKey has an exact optimum; these models' features are {features}.")
+    check_features(policies[0].config.features)
     optimum = Optimum(expert)
     window = policies[0].make_window(batch)
     index = batch["index"].to(policies[0].device)
@@ -185,9 +183,8 @@ def validate(runs: Sequence[Path], root: Path, repo_id: str, exact: Expert | Non
         A JSON record: for each run the chosen checkpoint's losses and training settings, and over the runs each task's
         mean and spread.
     """
-    provenance = _provenance(root)
-    if exact and (provenance or {}).get("expert", exact) != exact:
-        raise ValueError(f"{root} holds data of the expert {provenance['expert']!r}: its optimum is not {exact!r}'s.")
+    provenance = provenance_of(root)
+    check_expert(root, exact)
     results, chosen = [], []
     model = None
     for run in runs:
@@ -235,9 +232,21 @@ def validate(runs: Sequence[Path], root: Path, repo_id: str, exact: Expert | Non
     }
 
 
-def _provenance(root: Path) -> dict | None:
+def provenance_of(root: Path) -> dict | None:
+    """How a dataset was built: expert, maze, seed, command, ...; None where it was not built here."""
     path = root / "meta" / "provenance.json"
     return json.loads(path.read_text()) if path.exists() else None
+
+
+def check_expert(root: Path, exact: Expert | None) -> None:
+    """The optimum is that of the data's own expert.
+
+    Raises:
+        ValueError: the data are another's.
+    """
+    expert = (provenance_of(root) or {}).get("expert", exact)
+    if exact is not None and expert != exact:
+        raise ValueError(f"{root} holds data of the expert {expert!r}: its optimum is not {exact!r}'s.")
 
 
 def training_settings(checkpoint: Path) -> dict | None:
@@ -253,4 +262,4 @@ def training_settings(checkpoint: Path) -> dict | None:
     }
     for unrelated in ("input_features", "output_features", "features", "normalization_mapping", "pretrained_path"):
         policy.pop(unrelated, None)
-    return {**{key: config[key] for key in keep}, "policy": policy, "data": _provenance(Path(root)) if root else None}
+    return {**{key: config[key] for key in keep}, "policy": policy, "data": provenance_of(Path(root)) if root else None}

@@ -1,6 +1,7 @@
 """Records of experiments."""
 
 from collections.abc import Mapping
+from itertools import cycle
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -16,7 +17,7 @@ def learning_curves(record: Mapping[str, Any]) -> Figure:
     """
     figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
     axes = figure.subplots()
-    for run, colour, marker in zip(record["runs"], COLOURS, "os^Dvx", strict=False):
+    for run, colour, marker in zip(record["runs"], cycle(COLOURS), cycle("os^Dvx"), strict=False):
         points = run["checkpoints"]
         axes.errorbar(
             [point["updates"] for point in points],

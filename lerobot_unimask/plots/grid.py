@@ -78,7 +78,7 @@ def five_panels(panels: Sequence[Panel]) -> Figure:
 
     Under each panel's name stands its question, below the grid what came of it. Colour and arrows show time; the
     jitter only keeps trajectories apart that share cells. Drawn are the window's states: a rollout's last action, after
-    s[K-1], counts in its return alone.
+    s[K-1], counts in its return alone. A panel without trajectories has its grid alone.
     """
     figure = Figure(figsize=(WIDTH, 2.72), layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -86,8 +86,9 @@ def five_panels(panels: Sequence[Panel]) -> Figure:
     time = time_colours(steps)
     for number, (axes, panel) in enumerate(zip(row, panels, strict=True), start=1):
         draw_grid(axes)
-        _draw_trajectories(axes, np.asarray(panel.states), time)
-        _draw_given(axes, panel)
+        if panel.states:
+            _draw_trajectories(axes, np.asarray(panel.states), time)
+        _draw_given(axes, panel, steps)
         axes.text(0.5, 1.16, f"({number}) {panel.name}", transform=axes.transAxes, ha="center", fontsize=NORMAL)
         axes.set_title(panel.question, fontsize=0.86 * SMALL, family=MONOSPACE, pad=4)
         axes.set_xlabel(_outcome(panel), fontsize=SMALL + 0.5)
@@ -176,9 +177,9 @@ def _draw_way(axes: Axes, points: np.ndarray, colours: np.ndarray) -> None:
     axes.scatter(*points[-1], marker="s", s=38, color=colours[-1], edgecolors=BLACK, linewidths=0.8, zorder=4)
 
 
-def _draw_given(axes: Axes, panel: Panel) -> None:
+def _draw_given(axes: Axes, panel: Panel, steps: int) -> None:
     """A frame around the agent's cell of each state that was given in advance."""
-    for token, (_, state) in given_states(panel.given, len(panel.states[0])).items():
+    for token, (_, state) in given_states(panel.given, steps).items():
         x, y = coordinates(state[0])
         square(axes, x, y, fill=False, edgecolor=PURPLE, linewidth=2, linestyle=(0, (2.2, 1)), zorder=1.5)
         axes.text(x - 0.42, y + 0.4, token, fontsize=SMALL - 1, family=MONOSPACE, zorder=6)
@@ -194,8 +195,9 @@ def _outcome(panel: Panel) -> str:
         words = asked + words
         if not panel.given:
             words.append("goal reached" if all(panel.achieved["success"]) else "goal missed")
-    if "possible" in panel.achieved:
-        words.append(f"{panel.achieved['possible']} of {panel.achieved['samples']} samples possible")
+    if "possible histories" in panel.achieved:
+        found = panel.achieved["possible histories"]
+        words.append(f"{found} possible histories" if found else "no possible history found")
     return ", ".join(words)
 
 
