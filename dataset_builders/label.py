@@ -32,6 +32,7 @@ from dataset_builders.writer import (
     provenance_of_now,
     refuse_existing,
 )
+from lerobot_unimask.hub import commit_of
 from lerobot_unimask.returns import return_to_go
 
 Episode = dict[str, np.ndarray]  # a dataset's columns of numbers: (T,) where D = 1, else (T, D)
@@ -130,7 +131,8 @@ def add_label(
     Raises:
         FileNotFoundError: There is no dataset in `root`.
         FileExistsError: `output` exists and is not an empty folder; it is left as it was.
-        ValueError: The column exists, the labels do not make one, or `output` lies inside `root`.
+        ValueError: The column exists, the labels do not make one, `output` lies inside `root`, or there is none and
+            `root` is what the Hub's client keeps of a commit.
     """
     root = Path(root).expanduser().resolve()
     info = _read_info(root)
@@ -138,6 +140,8 @@ def add_label(
         raise ValueError(f"name is {name!r}; a label is named observation.NAME, or LeRobot reads no windows of it.")
     if name in info["features"]:
         raise ValueError(f"{root} has a column {name} already; choose another name.")
+    if output is None and (commit := commit_of(root)):
+        raise ValueError(f"{root} is commit {commit} of a Hub dataset, which stays as it is: give --output=DIR.")
     target = root if output is None else refuse_existing(output)
     if root in target.parents:
         raise ValueError(f"output is {target}, a folder inside the dataset itself; choose one beside it.")

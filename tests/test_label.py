@@ -222,6 +222,13 @@ def test_a_dataset_does_not_go_into_itself(root, refused):
     assert files(root) == before
 
 
+def test_a_commit_of_the_hub_stays_as_it_is(root, refused):
+    cached = root.parent / "snapshots" / ("a" * 40)
+    cached.parent.mkdir()
+    root.rename(cached)
+    assert "give --output=DIR" in refused(f"--dataset.root={cached}", f"--name={CORNER}", "--visits=agent_cell=0")
+
+
 @pytest.mark.parametrize("output", [None, "new"])
 @pytest.mark.parametrize("moment", ["_label_all", "_write_data", "_write_meta", "_put_in_place"])
 def test_an_interruption_leaves_nothing_half_written(moment, output, root, monkeypatch):
