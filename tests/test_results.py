@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import statistics
 from pathlib import Path
 
 import pytest
@@ -54,9 +55,56 @@ def test_forward_dynamics_put_their_probability_on_the_true_next_state():
     assert f"puts {truth:.3f} of its probability on the true next state" in README
 
 
-def test_maze2d_imitation_returns_what_the_readme_says():
-    (run,) = record("maze2d_bc_k5.json")["runs"]
-    last = run["checkpoints"][-1]
-    assert last["episodes"] == 1000
-    assert last["updates"] == run["training"]["steps"]
-    assert f"| most likely | {last['mean_return']:.2f} ± {last['standard_error']:.2f} | 2.81 | 3.30 |" in README
+def returns_of(name: str) -> list[float]:
+    return [value for task in record(name)["per_task"] for value in task["metrics"]["sum_rewards"]]
+
+
+def test_one_maze2d_model_acts_as_the_readme_says():
+    cells = []
+    for question in ("imitation", "return"):
+        returns = returns_of(f"maze2d_k10_{question}.json")
+        assert len(returns) == 1000
+        assert statistics.mean(returns) > 2.6
+        cells.append(f"{statistics.mean(returns):.2f} ± {statistics.stdev(returns) / len(returns) ** 0.5:.2f}")
+    assert f"| 10 | {cells[0]} | {cells[1]} |" in README
+
+
+def test_every_one_question_model_returns_at_least_2():
+    runs = record("maze2d_one_question.json")["runs"]
+    assert [run["run"] for run in runs] == ["maze2d_bc_k5", "maze2d_rc_k5", "maze2d_bc_k10", "maze2d_rc_k10"]
+    for run in runs:
+        last = run["checkpoints"][-1]
+        assert last["updates"] == 16000
+        assert last["episodes"] == 1000
+        assert last["mean_return"] >= 2.0
+        assert f"| `{run['run']}` | {last['mean_return']:.2f} ± {last['standard_error']:.2f} |" in README
+
+
+def test_a_random_mask_model_sees_five_steps_ahead():
+    ahead = record("maze2d_random_k10_measures.json")["ahead"]
+    assert ahead["model"] < ahead["last_displacement_repeated"]
+    assert f"| {ahead['model']:.4f} |" in README
+
+
+def test_encoded_inputs_are_worth_it():
+    summary = record("encoding.json")["summary"]
+    encoded, plain = summary["encoded numbers, K = 5"], summary["plain numbers, K = 5"]
+    for question in ("behavior_cloning", "reward_conditioned"):
+        assert encoded[question]["mean"] > plain[question]["mean"] + 0.5
+    assert encoded["error_ahead"]["mean"] < plain["error_ahead"]["mean"]
+
+
+def test_doorkey_does_what_it_is_asked():
+    asked = record("doorkey_questions.json")
+    assert asked["goals"]["times_imitation"] >= 3
+    for row in asked["returns"]["returns"]:
+        assert abs(row["mean_return"] - row["asked"]) < 0.75
+        assert f"| {row['asked']} | {row['mean_return']:.2f} ± {row['standard_error']:.2f} |" in README
+    assert asked["visits"]["asked_to"] >= 0.8
+    assert asked["visits"]["asked_not_to"] <= 0.1
+    assert asked["backward"]["dynamics"]["impossible_steps"] == 0
+    assert asked["backward"]["samples"] == 1000
+    assert asked["consistency"]["masks"] == 1000
+    assert asked["consistency"]["shown_values_changed"] == 0
+    for share in ("asked_to", "asked_not_to"):
+        assert f"{asked['visits'][share]:.1%}" in README
