@@ -466,8 +466,7 @@ def _questions(arguments: argparse.Namespace) -> None:
     record["command"] = arguments.text
     print(summary(record))
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(json.dumps(record, indent=2) + "\n")
+        _write_record(record, arguments.output)
         print(f"written to {arguments.output}")
 
 
@@ -503,8 +502,7 @@ def _validate(arguments: argparse.Namespace) -> None:
             line += f"  optimum {best:.4f}, expected {expected:.4f}"
         print(line)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(json.dumps(record, indent=2) + "\n")
+        _write_record(record, arguments.output)
         print(f"written to {arguments.output}")
 
 
@@ -549,8 +547,7 @@ def _measure(arguments: argparse.Namespace) -> None:
     record["command"], record["versions"] = arguments.text, versions()
     print(json.dumps(record, indent=2))
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(json.dumps(record, indent=2) + "\n")
+        _write_record(record, arguments.output)
         print(f"written to {arguments.output}")
 
 
@@ -567,11 +564,15 @@ def _curve(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
     )
     record["command"] = arguments.text
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(record, indent=2) + "\n")
+    _write_record(record, arguments.output)
     picture = arguments.output.with_suffix(".png")
     plots.learning_curves(record).savefig(picture, dpi=200)
     print(f"written to {arguments.output} and {picture}")
+
+
+def _write_record(record: dict, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def main(argv: list[str] | None = None) -> None:
