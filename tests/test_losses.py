@@ -85,6 +85,19 @@ def test_a_gaussians_scale_is_bounded():
         assert prediction.grad.isfinite().all()
 
 
+def test_a_gaussians_gradient_is_that_of_its_likelihood_times_its_scale():
+    component = make_factors(FEATURES, gaussian=True)["a"].components[0]
+    generator = torch.Generator().manual_seed(0)
+    value = torch.randn(B, K, 2, generator=generator)
+    mean, log_scale = (torch.randn(B, K, 2, generator=generator).requires_grad_() for _ in range(2))
+    component_loss(torch.cat([mean, log_scale], dim=-1), value, component).sum().backward()
+    density = torch.distributions.Normal(mean, log_scale.exp()).log_prob(value).mean(-1)
+    for numbers, gradient in zip(
+        (mean, log_scale), torch.autograd.grad(-density.sum(), (mean, log_scale)), strict=True
+    ):
+        torch.testing.assert_close(numbers.grad, gradient * log_scale.detach().exp())
+
+
 def test_a_perfect_prediction_costs_nothing():
     value = torch.tensor([[[2.0, 1.0, 0.5, -1.0, 3.0]]])
     agent, _, numbers = FACTORS["s"].components

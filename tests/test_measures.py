@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch.distributions import Categorical, Normal, kl_divergence
 
 from dataset_builders.maze2d import build_maze2d
@@ -11,6 +12,7 @@ from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.cli import main
 from lerobot_unimask.experiments.measures import (
     _divergence,
+    action_error,
     disagreement,
     error_ahead,
     latency,
@@ -67,6 +69,16 @@ def test_the_error_ahead_is_the_distance_to_the_true_state(make, root):
         error_ahead(policy, batch, 7)
 
 
+def test_the_action_error_is_that_of_the_answers_to_each_step(make, root):
+    policy = make()
+    batch = unseen_windows(policy, root, LAST)
+    actions = policy.make_window(batch).values["a"]
+    steps = range(policy.config.context_length)
+    answers = [policy.infer(batch, "behavior_cloning", t=t).most_likely("a")[:, t] for t in steps]
+    error = (torch.stack(answers, dim=1) - actions) / policy.statistics.a_std
+    assert action_error(policy, batch, "behavior_cloning") == pytest.approx(error.square().mean().item(), rel=1e-5)
+
+
 def test_divergences_are_those_of_torch():
     torch.manual_seed(0)
     p, q = torch.randn(2, 20, 4)
@@ -89,7 +101,13 @@ def test_directions_that_say_the_same_disagree_by_nothing(make, root):
 
 
 def test_a_record_holds_what_applies(make, root):
-    assert set(measure(make(), root, LAST, ahead=3)) == {"windows", "episodes", "ahead", "disagreement_nats"}
+    assert set(measure(make(), root, LAST, ahead=3)) == {
+        "windows",
+        "episodes",
+        "action_error",
+        "ahead",
+        "disagreement_nats",
+    }
     assert "disagreement_nats" not in measure(make(attention="bidirectional"), root, LAST, ahead=3)
     assert "ahead" not in measure(make(), root, LAST, ahead=7)
     timed = latency(make(), calls=5)
@@ -103,6 +121,7 @@ name: short
 variants:
   both: {{}}
   plain: {{fine_inputs: false}}
+  zeros: {{zero_hidden: true}}
 context_lengths: [4, 6]
 seeds: [0]
 steps: 2
@@ -117,7 +136,7 @@ output: {tmp_path / "out"}
     main(["ablation", f"--config_path={config}"])
     record = json.loads((tmp_path / "out" / "short.json").read_text())
     assert [(run["row"], run["context_length"]) for run in record["runs"]] == [
-        ("both", 4), ("plain", 4), ("both", 6), ("plain", 6),
+        ("both", 4), ("plain", 4), ("zeros", 4), ("both", 6), ("plain", 6), ("zeros", 6),
     ]  # fmt: skip
     for run in record["runs"]:
         assert run["steps"] == 2
@@ -125,6 +144,14 @@ output: {tmp_path / "out"}
         cell = record["summary"][f"{run['row']}, K = {run['context_length']}"]
         assert cell["error_ahead"]["mean"] == pytest.approx(run["ahead"]["model"])
         assert cell["behavior_cloning"]["mean"] == pytest.approx(run["returns"]["behavior_cloning"]["mean_return"])
+    hidden = {
+        row: load_file(tmp_path / "out" / "checkpoints" / f"{row}-4-0" / "model.safetensors")[
+            "network.embeddings.s.hidden"
+        ]
+        for row in ("both", "zeros")
+    }
+    assert hidden["both"].abs().min() > 0
+    assert hidden["zeros"].abs().max() == 0
     assert (tmp_path / "out" / "short.png").stat().st_size > 10_000
     assert "| plain, K = 6 |" in capsys.readouterr().out
 

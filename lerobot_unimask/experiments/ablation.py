@@ -1,7 +1,7 @@
 """What earns its place: the same model with one thing changed at a time, at equal updates, on Maze2D.
 
 A variant is a set of policy settings. Every run trains one model, rolls it out with both questions, and measures how
-far ahead it sees, whether its directions agree, and what it costs.
+well it predicts unseen actions, how far ahead it sees, whether its directions agree, and what it costs.
 """
 
 import json
@@ -33,7 +33,8 @@ class AblationConfig:
     name: str = "ablation"
     # Of the study: runs of the same name in the same storage are shared.
     variants: dict[str, dict[str, Any]] = field(default_factory=lambda: {"default": {}})
-    # Name -> settings of the policy that differ from `policy`.
+    # Name -> settings of the policy that differ from `policy`; and `zero_hidden: true`, which is none of the policy's:
+    # hidden tokens are embedded as zeros, and stay so.
     context_lengths: list[int] = field(default_factory=lambda: [10])
     seeds: list[int] = field(default_factory=lambda: [0, 1])
     steps: int = 2000
@@ -96,6 +97,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
     """One run: train, save, roll out, measure."""
     settings = {**config.policy, "push_to_hub": False, "context_length": run["context_length"]}
     settings |= config.variants[run["row"]]
+    zero_hidden = settings.pop("zero_hidden", False)
     root = Path(config.data)
     trainer = Trainer(
         settings,
@@ -105,6 +107,9 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         batch_size=config.batch_size,
         episodes=list(range(config.training_episodes)),
     )
+    if zero_hidden:
+        for embedding in trainer.policy.network.embeddings.values():
+            embedding.hidden.requires_grad_(False).zero_()
     began = time.process_time()
     losses = list(trainer)
     seconds = time.process_time() - began
@@ -124,7 +129,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         "returns": returns,
         "steps": config.steps,
         "batch_size": config.batch_size,
-        "settings": settings,
+        "settings": settings | {"zero_hidden": zero_hidden},
         "parameters": sum(parameter.numel() for parameter in policy.network.parameters()),
         "processor_seconds_per_update": seconds / config.steps,
         "latency": latency(policy),
@@ -141,6 +146,9 @@ def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
         cells = found.setdefault(f"{record['row']}, K = {record['context_length']}", {})
         for question, result in record["returns"].items():
             cells.setdefault(question, []).append((result["mean_return"], result["standard_error"]))
+        if "action_error" in record:
+            for question, error in record["action_error"].items():
+                cells.setdefault(f"{question}_error", []).append((error, 0.0))
         if "ahead" in record:
             cells.setdefault("error_ahead", []).append((record["ahead"]["model"], 0.0))
         cells.setdefault("ms_per_update", []).append((1000 * record["processor_seconds_per_update"], 0.0))
@@ -161,11 +169,19 @@ def markdown(record: Mapping[str, Any]) -> str:
     columns = {
         "behavior_cloning": "imitation",
         "reward_conditioned": "reward-conditioned",
+        "behavior_cloning_error": "error of the imitated action",
+        "reward_conditioned_error": "of the reward-conditioned one",
         "error_ahead": f"error {config['ahead']} steps ahead",
         "ms_per_update": "ms of processor per update",
         "latency_ms": "ms per action",
     }
-    digits = {"error_ahead": 4, "ms_per_update": 0, "latency_ms": 1}
+    digits = {
+        "behavior_cloning_error": 3,
+        "reward_conditioned_error": 3,
+        "error_ahead": 4,
+        "ms_per_update": 0,
+        "latency_ms": 1,
+    }
     lines = [
         f"{config['steps']} updates of {config['batch_size']} windows, {len(config['seeds'])} seed(s), "
         f"{config['rollouts']} rollouts each, ± standard error over seeds (of one seed, over rollouts).\n",

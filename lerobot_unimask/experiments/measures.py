@@ -1,4 +1,5 @@
-"""What a policy's answers say of themselves: how far ahead they see, whether both directions agree, how long they take.
+"""What a policy's answers say of themselves: how near they come to the recorded actions, how far ahead they see, whether
+both directions agree, how long they take.
 
 Legend of shapes: B windows, K steps, D the dimensions of a state.
 """
@@ -15,6 +16,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from lerobot_unimask import inference
 from lerobot_unimask.masks import Mask
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.window import RETURN_SO_FAR, Component
@@ -64,6 +66,23 @@ def error_ahead(policy: UniMASKPolicy, batch: dict[str, Tensor], ahead: int) -> 
         "last_displacement_repeated": (repeated - truth).norm(dim=-1).mean().item(),
         "windows": len(truth),
     }
+
+
+@torch.no_grad()
+def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str) -> float:
+    """The mean squared error of the predicted action, in standard deviations of the data, over all windows, steps t and
+    dimensions: what a rollout's returns follow, and far less noisy than they are."""
+    policy.eval()
+    recorded = policy.make_window(batch)
+    actions = recorded.values["a"]  # (B, K, D)
+    table = policy._table(question)
+    errors = []
+    for t in table.t.tolist():
+        mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
+        answer = inference.answer(policy.predict, policy.statistics, policy.factors, recorded, mask)
+        error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.a_std
+        errors.append(error[mask.predict["a"][:, t]].square().flatten())
+    return torch.cat(errors).mean().item()
 
 
 @torch.no_grad()
@@ -127,10 +146,12 @@ def measure(policy: UniMASKPolicy, root: Path, episodes: Sequence[int], *, ahead
     """A JSON record of all that applies to this policy, over windows of episodes that it was not trained on."""
     batch = unseen_windows(policy, root, episodes)
     record: dict[str, Any] = {"windows": len(batch["index"]), "episodes": len(episodes)}
+    questions = ["behavior_cloning"] + ["reward_conditioned"] * ("rtg" in policy.factors)
+    if not any(component.discrete for component in policy.factors["a"].components):
+        record["action_error"] = {question: action_error(policy, batch, question) for question in questions}
     continuous = not any(component.discrete for component in policy.factors["s"].components)
     if continuous and policy.config.attention != "causal" and policy.config.context_length >= ahead + 2:
         record["ahead"] = error_ahead(policy, batch, ahead)
     if policy.config.attention == "both":
-        questions = ["behavior_cloning"] + ["reward_conditioned"] * ("rtg" in policy.factors)
         record["disagreement_nats"] = {question: disagreement(policy, batch, question) for question in questions}
     return record
