@@ -16,10 +16,10 @@ def component_loss(prediction: Tensor, value: Tensor, component: Component) -> T
     """What one component costs at every step, (B, K): cross-entropy in nats; or, averaged over its dimensions and in
     units of their standard deviations, the squared error or a Gaussian's negative log-likelihood in nats.
 
-    Note: A Gaussian's gradient is that of the negative log-likelihood times the predicted scale (Seitzer et al., "On the
-        pitfalls of heteroscedastic uncertainty estimation", 2022, beta = 1/2). Without it, what is predicted to within a
-        fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model of where the mass moves
-        never learns what it does (docs/experiments.md).
+    Note: A Gaussian's gradient is that of the negative log-likelihood times the predicted scale (Seitzer et al., "On
+        the pitfalls of heteroscedastic uncertainty estimation", 2022, beta = 1/2). Without it, what is predicted to
+        within a fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model that learns
+        where the mass goes is slow to learn what moves it (docs/experiments.md).
     """
     target = value[..., component.dims]
     if component.discrete:

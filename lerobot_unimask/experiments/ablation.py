@@ -175,13 +175,8 @@ def markdown(record: Mapping[str, Any]) -> str:
         "ms_per_update": "ms of processor per update",
         "latency_ms": "ms per action",
     }
-    digits = {
-        "behavior_cloning_error": 3,
-        "reward_conditioned_error": 3,
-        "error_ahead": 4,
-        "ms_per_update": 0,
-        "latency_ms": 1,
-    }
+    digits = dict.fromkeys(columns, 2) | {"error_ahead": 4, "ms_per_update": 0, "latency_ms": 1}
+    digits |= {"behavior_cloning_error": 3, "reward_conditioned_error": 3}
     lines = [
         f"{config['steps']} updates of {config['batch_size']} windows, {len(config['seeds'])} seed(s), "
         f"{config['rollouts']} rollouts each, ± standard error over seeds (of one seed, over rollouts).\n",
@@ -189,7 +184,7 @@ def markdown(record: Mapping[str, Any]) -> str:
         "| --- " * (1 + len(columns)) + "|",
     ]
     for row, cells in record["summary"].items():
-        texts = [_text(cells.get(name), digits.get(name, 2)) for name in columns]
+        texts = [_text(cells.get(name), digits[name]) for name in columns]
         lines.append(f"| {row} | " + " | ".join(texts) + " |")
     return "\n".join(lines) + "\n"
 

@@ -1,5 +1,5 @@
-"""What a policy's answers say of themselves: how near they come to the recorded actions, how far ahead they see, whether
-both directions agree, how long they take.
+"""What a policy's answers say: how near they come to recorded actions, how far ahead they see, whether both directions
+agree, how long they take.
 
 Legend of shapes: B windows, K steps, D the dimensions of a state.
 """
