@@ -262,18 +262,24 @@ class MaskTable:
     predict: Tensor
     t: Tensor
 
-    @property
+    @functools.cached_property
     def shows(self) -> dict[str, Tensor]:
         """factor -> (K,) bool: tokens shown by some row."""
         return dict(zip(self.factors, self.visible.any(0), strict=True))
 
-    @property
+    @functools.cached_property
     def shows_ahead(self) -> dict[str, Tensor]:
         """factor -> (K,) bool: tokens shown by some row before a rollout at its t can have observed them."""
         steps, t = torch.arange(self.visible.shape[-1]), self.t[:, None]
         ahead = {"s": steps > t, "a": steps >= t}  # (R, K); a property is never observed
         always = torch.ones_like(steps > t)
         return {name: (self.visible[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
+
+    @functools.cached_property
+    def acts(self) -> bool:
+        """Whether there is a row for every step t of the window, and it asks for a[t]: a question for rollouts."""
+        steps = torch.arange(self.visible.shape[-1])
+        return torch.equal(self.t, steps) and bool(self.predict[steps, self.factors.index("a"), steps].all())
 
     def masks(self) -> "Mask":
         """Every row as one batch of masks."""
@@ -496,6 +502,7 @@ class TrainingMasks(nn.Module):
         self._keep("visible", torch.cat([empty, *(table.visible for table in tables.values())]))
         self._keep("predict", torch.cat([empty, *(table.predict for table in tables.values())]))
         self._keep("task_of_row", torch.tensor([tasks[text] for text in tables for _ in tables[text].t]).long())
+        self._keep("askable", torch.tensor([name in ASKABLE for name in self.factors])[:, None])  # (F, 1)
         self._keep("cumulative_weights", _cumulative(weights))
         forms = [self._causal_form(tables.get(text), context_length) for text in self.weights]
         capable = torch.tensor([form is not None for form in forms])
@@ -523,7 +530,7 @@ class TrainingMasks(nn.Module):
         """What a causal window of this task, None for random masking, shows and asks for: two (F, K), or None."""
         if table is None:
             visible = torch.ones(len(self.factors), K, dtype=torch.bool)
-            predict = torch.tensor([name in ASKABLE for name in self.factors])[:, None].repeat(1, K)
+            predict = self.askable.repeat(1, K)
             predict[self.factors.index("s"), 0] = False  # nothing of the window comes before it
             visible[[f for f, name in enumerate(self.factors) if name not in ASKABLE], 1:] = False
             return visible, predict
@@ -565,18 +572,17 @@ class TrainingMasks(nn.Module):
         if len(self.visible):
             visible, predict = self._question_masks(valid, task, uniform[:, 1])
         hidden = self._hidden(uniform[:, 2], uniform[:, 3:-1].view(B, F, K))
-        askable = torch.tensor([name in ASKABLE for name in self.factors], device=valid.device)[:, None]
         if self.random_task is not None:
             chosen = (task == self.random_task)[:, None, None]
             visible = torch.where(chosen, ~hidden, visible)
-            predict = torch.where(chosen, hidden & askable, predict)
+            predict = torch.where(chosen, hidden & self.askable, predict)
         causal: Tensor | bool = False
         if self.causal_share > 0:
             causal = self._draw_causal(uniform[:, -1], seed, step)  # (B,)
             task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
             shown = self.causal_visible[task]
             if self.random_task is not None:
-                shown = shown & (askable | ~hidden | (task != self.random_task)[:, None, None])
+                shown = shown & (self.askable | ~hidden | (task != self.random_task)[:, None, None])
             visible = torch.where(causal[:, None, None], shown, visible)
             predict = torch.where(causal[:, None, None], self.causal_predict[task], predict)
         visible, predict = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (visible, predict))

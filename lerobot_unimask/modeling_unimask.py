@@ -40,6 +40,25 @@ logger = logging.getLogger(__name__)
 VALIDATION_STEP = -1
 
 
+class LossParts(Mapping[str, float]):
+    """What makes up a loss, for the log: scalar tensors, read off the device when somebody asks for the numbers.
+
+    lerobot-train does so once it has waited for the update, so that between forward and backward nothing waits.
+    """
+
+    def __init__(self, parts: Mapping[str, Tensor | float]):
+        self._parts = parts
+
+    def __getitem__(self, name: str) -> float:
+        return float(self._parts[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+
 class UniMASKPolicy(PreTrainedPolicy):
     """One masked transformer over windows of states, actions and returns (Carroll et al., NeurIPS 2022).
 
@@ -143,7 +162,7 @@ class UniMASKPolicy(PreTrainedPolicy):
 
     # --- Training ----------------------------------------------------------------------------------------------------
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, Mapping[str, float]]:
         """The loss of one batch.
 
         Args:
@@ -160,8 +179,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         predictions = self.network(window, mask.visible, mask.causal)
         losses = masked_losses(predictions, window, mask.predict, self.factors)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
-        parts = torch.stack(list(losses.values())).tolist()  # one synchronisation with the device, not one for each
-        return loss, {f"loss_{name}": part for name, part in zip(losses, parts, strict=True)}
+        return loss, LossParts({f"loss_{name}": part.detach() for name, part in losses.items()})
 
     def update(self) -> None:
         """Count an update; LeRobot calls this after each optimiser step."""
@@ -334,9 +352,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             MaskError: it does not ask for a[t].
         """
         table = self._table(text)
-        K = self.config.context_length
-        steps = table.t.tolist()
-        if steps != list(range(K)) or not all(table.predict[t, table.factors.index("a"), t] for t in steps):
+        if not table.acts:
             raise MaskError(
                 "A mask for a rollout asks for a[t] at every step, as 'a[t] | s[:t+1], a[:t]' does.",
                 table.question.text,
@@ -577,11 +593,13 @@ def _read_config(folder: Path) -> UniMASKConfig:
 def _evaluation(policy: UniMASKPolicy) -> Iterator[None]:
     """Answers are given without dropout, also while the policy is being trained."""
     was_training = policy.training
-    policy.eval()
+    if was_training:  # each change of mode walks through all modules
+        policy.eval()
     try:
         yield
     finally:
-        policy.train(was_training)
+        if was_training:
+            policy.train()
 
 
 def _index(batch: Mapping[str, Tensor], window: Window) -> Tensor:

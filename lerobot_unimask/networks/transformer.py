@@ -109,11 +109,10 @@ class FactorEmbedding(nn.Module):
     def __init__(self, factor: Factor, width: int, *, fine_inputs: bool):
         super().__init__()
         self.discrete = {c.dims.start: c.categories for c in factor.components if c.discrete}
-        continuous = [i for c in factor.components if not c.discrete for i in range(c.dims.start, c.dims.stop)]
-        self.continuous = continuous
+        self.continuous = [c.dims for c in factor.components if not c.discrete]
         self.categories = nn.ModuleList(nn.Embedding(count, width) for count in self.discrete.values())
-        if continuous:
-            self.encoding = NumberEncoding(len(continuous), fine=fine_inputs)
+        if self.continuous:
+            self.encoding = NumberEncoding(sum(d.stop - d.start for d in self.continuous), fine=fine_inputs)
             self.numbers = nn.Linear(self.encoding.size, width)
         # Small, or in a stacked token what is hidden would drown what is shown, and learning takes twice as long.
         self.hidden = nn.Parameter(0.02 * torch.randn(width))
@@ -125,7 +124,8 @@ class FactorEmbedding(nn.Module):
         value = torch.where(shown, value, 0.0)
         parts = [table(value[..., i].long()) for i, table in zip(self.discrete, self.categories, strict=True)]
         if self.continuous:
-            parts.append(self.numbers(self.encoding(value[..., self.continuous], visible)))
+            numbers = torch.cat([value[..., dims] for dims in self.continuous], dim=-1)
+            parts.append(self.numbers(self.encoding(numbers, visible)))
         return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
 
 
@@ -159,16 +159,17 @@ class Block(nn.Module):
         )
 
     def forward(
-        self, x: Tensor, attend: Tensor | None, past: tuple[Tensor, Tensor] | None
+        self, x: Tensor, attend: Tensor | None, past: tuple[Tensor, Tensor] | None, *, last_alone: bool = False
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """
         Args:
             x: (B, n, W), the last n of N tokens.
             attend: which of the N tokens each of the n sees, True = seen; None: all.
             past: keys and values of the tokens before them, (B, H, N - n, W/H).
+            last_alone: nobody reads what comes out for the others, so it is not computed.
 
         Returns:
-            (B, n, W), and the keys and values of all N tokens.
+            (B, n, W), or (B, 1, W), and the keys and values of all N tokens.
         """
         B, n, W = x.shape
         qkv = self.query_key_value(self.norm_attention(x)).view(B, n, 3, self.heads, W // self.heads)
@@ -177,10 +178,12 @@ class Block(nn.Module):
         query, key, value = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, n, W/H)
         if past is not None:
             key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
+        if last_alone:
+            x, query, attend = x[:, -1:], query[:, :, -1:], None if attend is None else attend[-1:]
         dropout = self.dropout if self.training else 0.0
         with torch.autocast("cpu", enabled=False):
             attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=attend, dropout_p=dropout)
-        attended = self.project(attended.transpose(1, 2).reshape(B, n, W))
+        attended = self.project(attended.transpose(1, 2).reshape(B, -1, W))
         x = x + functional.dropout(attended, self.dropout, self.training)
         return x + self.feedforward(self.norm_feedforward(x)), (key, value)
 
@@ -282,17 +285,18 @@ class Transformer(nn.Module):
         return x
 
     def _extend(self, x: Tensor, count: int, cache: Cache) -> Tensor:
-        """The first `count` tokens of (B, N, W), those alone that the cache lacks; elsewhere 0."""
+        """The last of the first `count` tokens of (B, N, W), from those alone that the cache lacks; elsewhere 0."""
         if not cache.matches(x[:, :count]) or cache.inputs.shape[1] == count:
             cache.inputs, cache.keys, cache.values = None, [], []
         start = 0 if cache.inputs is None else cache.inputs.shape[1]
         attend = _before_or_here(count, x.device)[start:]
         new = x[:, start:count]
         for depth, block in enumerate(self.blocks):
-            new, kept = block(new, attend, (cache.keys[depth], cache.values[depth]) if start else None)
+            past = (cache.keys[depth], cache.values[depth]) if start else None
+            new, kept = block(new, attend, past, last_alone=depth == len(self.blocks) - 1)
             cache.keys[depth : depth + 1], cache.values[depth : depth + 1] = [kept[0]], [kept[1]]
         cache.inputs = x[:, :count]
-        return functional.pad(new, (0, 0, start, x.shape[1] - count))
+        return functional.pad(new, (0, 0, count - 1, x.shape[1] - count))
 
     def _count(self, visible: dict[str, Tensor]) -> int:
         """Tokens up to the last state or action that is shown in some window."""
