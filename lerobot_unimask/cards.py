@@ -21,8 +21,9 @@ from matplotlib.figure import Figure
 
 from lerobot_unimask import plots
 from lerobot_unimask.envs import doorkey, maze2d
-from lerobot_unimask.masks import RANDOM_MASK, TASKS, Mask, TrainingMasks, tabulate
+from lerobot_unimask.masks import RANDOM_MASK, TASKS, Mask, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.training_masks import TrainingMasks
 
 PLUGIN = "lerobot_policy_unimask"
 INSTALL = f"pip install {PLUGIN}  # or, in a copy of the project: pip install ."

@@ -14,7 +14,8 @@ from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_PREFIX, OBS_STATE
 
-from lerobot_unimask.masks import MAX_CONTEXT, RANDOM_MASK, mixture, parse
+from lerobot_unimask.masks import MAX_CONTEXT, RANDOM_MASK, parse
+from lerobot_unimask.training_masks import mixture
 from lerobot_unimask.window import RETURN_TO_GO, Feature
 
 # Each network with the ways in which it can attend, its default first

@@ -26,11 +26,12 @@ from lerobot_unimask import hub, inference
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.inference import Answer, Check, Given, RolloutMemory, Samples
 from lerobot_unimask.losses import masked_losses
-from lerobot_unimask.masks import Mask, MaskError, MaskTable, TrainingMasks, tabulate
+from lerobot_unimask.masks import Mask, MaskError, MaskTable, tabulate
 from lerobot_unimask.networks import make_network
 from lerobot_unimask.networks.transformer import Cache, Predictions
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 from lerobot_unimask.returns import EpisodeStarts, read_starts
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import RETURN_SO_FAR, RETURN_TO_GO, Statistics, Window, make_factors, make_window
 
 logger = logging.getLogger(__name__)

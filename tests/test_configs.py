@@ -15,7 +15,8 @@ from lerobot_unimask.experiments.ablation import AblationConfig
 from lerobot_unimask.experiments.heatmap import HeatmapConfig
 from lerobot_unimask.experiments.study import read_config
 from lerobot_unimask.experiments.table import TableConfig
-from lerobot_unimask.masks import TrainingMasks, tabulate
+from lerobot_unimask.masks import tabulate
+from lerobot_unimask.training_masks import TrainingMasks
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted(path.relative_to(ROOT) for path in ROOT.glob("configs/*.yaml"))

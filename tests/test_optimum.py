@@ -20,7 +20,8 @@ from lerobot_unimask.experiments.optimum import (
     random_mask_divergence,
 )
 from lerobot_unimask.losses import masked_losses
-from lerobot_unimask.masks import TASKS, Mask, TrainingMasks, tabulate
+from lerobot_unimask.masks import TASKS, Mask, tabulate
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import Window
 
 EXPERTS = ("paper", "released")

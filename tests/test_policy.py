@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_unimask import TASKS, MaskError, UniMASKConfig, UniMASKPolicy, Window
 from lerobot_unimask.inference import ORDERS
-from lerobot_unimask.masks import TrainingMasks, mixture
+from lerobot_unimask.training_masks import TrainingMasks, mixture
 
 KINDS = ("doorkey", "continuous", "gaussian")
 LAYOUTS = {

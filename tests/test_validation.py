@@ -13,9 +13,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask import TASKS, UniMASKPolicy
 from lerobot_unimask.experiments.validation import checkpoints_of, first_windows, task_losses, validate
-from lerobot_unimask.masks import RANDOM_MASK, Mask, TrainingMasks
+from lerobot_unimask.masks import RANDOM_MASK, Mask
 from lerobot_unimask.modeling_unimask import VALIDATION_STEP
 from lerobot_unimask.reads import ENVIRONMENT_VARIABLE
+from lerobot_unimask.training_masks import TrainingMasks
 
 ALL = (*TASKS, RANDOM_MASK)
 EPISODES = 30  # of the dataset in conftest

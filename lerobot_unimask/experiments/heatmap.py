@@ -28,8 +28,9 @@ from lerobot_unimask.experiments.optimum import FEATURES, Optimum, entropies, me
 from lerobot_unimask.experiments.study import Run, key, run_study
 from lerobot_unimask.experiments.training import Trainer
 from lerobot_unimask.experiments.validation import answered, first_windows, read_first_windows, task_losses
-from lerobot_unimask.masks import RANDOM_MASK, TASKS, TrainingMasks
+from lerobot_unimask.masks import RANDOM_MASK, TASKS
 from lerobot_unimask.modeling_unimask import VALIDATION_STEP
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import make_window
 
 FINETUNE = "finetune"

@@ -32,9 +32,10 @@ from lerobot_unimask.envs.doorkey import (
     step,
 )
 from lerobot_unimask.inference import Answer
-from lerobot_unimask.masks import RANDOM_MASK, Mask, TrainingMasks
+from lerobot_unimask.masks import RANDOM_MASK, Mask
 from lerobot_unimask.modeling_unimask import VALIDATION_STEP
 from lerobot_unimask.networks.transformer import Predictions
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import ACTION, RETURN_TO_GO, STATE, Feature, Statistics, Window, make_factors
 
 FEATURES = {

@@ -30,8 +30,9 @@ from lerobot_unimask.envs.doorkey import (
 )
 from lerobot_unimask.experiments.gridworld import BACKWARDS_QUESTION, START, possible_steps
 from lerobot_unimask.inference import Check, Given, Samples
-from lerobot_unimask.masks import RANDOM_MASK, TASKS, Mask, TrainingMasks
+from lerobot_unimask.masks import RANDOM_MASK, TASKS, Mask
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import RETURN_SO_FAR, STATE
 
 IMITATION, GOAL, RETURN = (TASKS[name] for name in ("behavior_cloning", "goal_conditioned", "reward_conditioned"))

@@ -31,8 +31,9 @@ from lerobot_unimask.experiments.optimum import (
     random_mask_divergence,
 )
 from lerobot_unimask.losses import masked_losses
-from lerobot_unimask.masks import RANDOM_MASK, TASKS, Mask, MaskError, TrainingMasks
+from lerobot_unimask.masks import RANDOM_MASK, TASKS, Mask, MaskError
 from lerobot_unimask.modeling_unimask import VALIDATION_STEP, UniMASKPolicy
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import Window
 
 logger = logging.getLogger(__name__)
