@@ -33,8 +33,9 @@ class AblationConfig:
     name: str = "ablation"
     # Of the study: runs of the same name in the same storage are shared.
     variants: dict[str, dict[str, Any]] = field(default_factory=lambda: {"default": {}})
-    # Name -> settings of the policy that differ from `policy`; and `zero_hidden: true`, which is none of the policy's:
-    # hidden tokens are embedded as zeros, and stay so.
+    # Name -> settings of the policy that differ from `policy`.
+    zero_hidden: list[str] = field(default_factory=list)
+    # Variants in which hidden tokens are embedded as zeros, which is no setting of the policy.
     context_lengths: list[int] = field(default_factory=lambda: [10])
     seeds: list[int] = field(default_factory=lambda: [0, 1])
     steps: int = 2000
@@ -55,6 +56,8 @@ class AblationConfig:
             raise ValueError("An ablation needs at least one variant, context length and seed.")
         if any("/" in name for name in self.variants):
             raise ValueError("A variant gives its files their names: leave '/' out of it.")
+        if unknown := set(self.zero_hidden) - self.variants.keys():
+            raise ValueError(f"zero_hidden names {unknown.pop()!r}; the variants are {', '.join(self.variants)}.")
         if min(self.steps, self.rollouts, self.training_episodes) < 1 or self.training_episodes >= self.episodes:
             raise ValueError("steps and rollouts are at least 1, training_episodes too and fewer than episodes.")
 
@@ -75,9 +78,12 @@ def ablation(config: AblationConfig, *, storage: str | None = None, workers: int
         for variant in config.variants
     ]
     output = Path(config.output)
-    axes = ("name", "variants", "context_lengths", "seeds", "output")
+    axes = ("name", "variants", "zero_hidden", "context_lengths", "seeds", "output")
     settings = {name: value for name, value in asdict(config).items() if name not in axes}
-    settings |= {f"variants.{name}": variant for name, variant in config.variants.items()}
+    settings |= {
+        f"variants.{name}": variant | {"zero_hidden": name in config.zero_hidden}
+        for name, variant in config.variants.items()
+    }
     do = partial(run_study, config.name, runs, partial(execute, config), output=output, settings=settings)
     records = do(storage=storage, workers=workers, **study)
     record = {
@@ -97,7 +103,6 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
     """One run: train, save, roll out, measure."""
     settings = {**config.policy, "push_to_hub": False, "context_length": run["context_length"]}
     settings |= config.variants[run["row"]]
-    zero_hidden = settings.pop("zero_hidden", False)
     root = Path(config.data)
     trainer = Trainer(
         settings,
@@ -107,7 +112,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         batch_size=config.batch_size,
         episodes=list(range(config.training_episodes)),
     )
-    if zero_hidden:
+    if run["row"] in config.zero_hidden:
         for embedding in trainer.policy.network.embeddings.values():
             embedding.hidden.requires_grad_(False).zero_()
     began = time.process_time()
@@ -129,7 +134,8 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         "returns": returns,
         "steps": config.steps,
         "batch_size": config.batch_size,
-        "settings": settings | {"zero_hidden": zero_hidden},
+        "settings": settings,
+        "zero_hidden": run["row"] in config.zero_hidden,
         "parameters": sum(parameter.numel() for parameter in policy.network.parameters()),
         "processor_seconds_per_update": seconds / config.steps,
         "latency": latency(policy),
