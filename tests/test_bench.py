@@ -126,7 +126,7 @@ def allocate(mebibytes):
 
 
 def test_a_measurements_memory_is_its_own():
-    large, small = (alone(allocate, mebibytes)["peak_memory_mib"] for mebibytes in (301, 1))
+    large, small = (alone("memory", allocate, mebibytes)["peak_memory_mib"] for mebibytes in (301, 1))
     assert large - small == pytest.approx(300, abs=20)
 
 

@@ -96,7 +96,7 @@ QUICK = Size(
     updates=3,
     slow_updates=2,
     calls=2,
-    environments=(1, 2),
+    environments=(1,),
     rollouts=2,
     growth={"context_length": (5, 10), "width": (16, 32), "batch_size": (8, 16), "episodes": (4, 8)},
 )
@@ -131,26 +131,32 @@ def bench(configs: Path, *, quick: bool = False) -> dict[str, Any]:
         build_doorkey(roots["doorkey"], episodes=size.episodes["doorkey"], expert="released", progress=False)
         build_maze2d(roots["maze2d"], episodes=size.episodes["maze2d"], progress=False)
         settings = {name: yaml.safe_load((configs / file).read_text()) for name, file in CONFIGS.items()}
-        record["imports"] = alone(nothing)
+        record["imports"] = alone("imports", nothing)
         record["reading"] = {
             who: alone(
-                reading, roots["doorkey"], item_by_item=who == "lerobot", windows=size.batch_size, repeats=size.repeats
+                f"reading, {who}",
+                reading,
+                roots["doorkey"],
+                item_by_item=who == "lerobot",
+                windows=size.batch_size,
+                repeats=size.repeats,
             )
             for who in ("lerobot", "unimask")
         }
         record["training"] = _training(size, configs, roots)
+        policy = settings["maze2d"]["policy"], roots["maze2d"]
         record["acting"] = {
             name: {
-                str(count): alone(acting, name, settings["maze2d"]["policy"], roots["maze2d"], count, size.calls)
+                str(count): alone(f"acting, {name}, {count} environments", acting, name, *policy, count, size.calls)
                 for count in size.environments
             }
             for name in POLICIES
             if name != "diffusion" or find_spec("diffusers")
         }
         record["building"] = {
-            who: alone(building, who, size.episodes["maze2d"], size.repeats) for who in ("stepping", "building")
+            who: alone(who, building, who, size.episodes["maze2d"], size.repeats) for who in ("stepping", "building")
         }
-        record["evaluating"] = alone(evaluating, settings["maze2d"]["policy"], roots["maze2d"], size.rollouts)
+        record["evaluating"] = alone("evaluating", evaluating, *policy, size.rollouts)
         record["growth"] = _growth(size, settings["maze2d"]["policy"], Path(folder))
     record["seconds"] = round(time.monotonic() - began)
     return record
@@ -172,7 +178,8 @@ def _training(size: Size, configs: Path, roots: Mapping[str, Path]) -> dict[str,
     for name, (config, arguments, changes) in variants.items():
         updates = size.slow_updates if "batched_reads" in changes else size.updates
         arguments = [f"--batch_size={size.batch_size}", *arguments]
-        found[name] = alone(training, configs / CONFIGS[config], roots[config], updates, arguments, **changes)
+        path, root = configs / CONFIGS[config], roots[config]
+        found[name] = alone(f"training, {name}", training, path, root, updates, arguments, **changes)
     return found
 
 
@@ -191,7 +198,7 @@ def _growth(size: Size, policy: Mapping[str, Any], folder: Path) -> dict[str, li
                 settings[what] = value
             if what == "width":
                 settings["feedforward_width"] = 4 * value
-            cost = alone(updating, settings, root, batch_size, size.slow_updates)
+            cost = alone(f"{what} = {value}", updating, settings, root, batch_size, size.slow_updates)
             found.setdefault(what, []).append({what: value, **cost})
     return found
 
@@ -199,12 +206,9 @@ def _growth(size: Size, policy: Mapping[str, Any], folder: Path) -> dict[str, li
 # --- Each in a process of its own ------------------------------------------------------------------------------------
 
 
-def alone(measure: Callable[..., dict[str, Any]], *arguments: Any, **keywords: Any) -> dict[str, Any]:
-    """What a function of this module returns in a process of its own, with the peak of that process's memory."""
-    name = ", ".join(
-        [measure.__name__, *(str(a) for a in (*arguments, *keywords.items()) if isinstance(a, str | tuple))]
-    )
-    print(f"{name} ...", file=sys.stderr, flush=True)
+def alone(label: str, measure: Callable[..., dict[str, Any]], *arguments: Any, **keywords: Any) -> dict[str, Any]:
+    """What a function of this module returns in a process of its own, with that process's seconds and peak memory."""
+    print(f"{label} ...", file=sys.stderr, flush=True)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     with ProcessPoolExecutor(1, mp_context=context) as process:
@@ -375,7 +379,7 @@ def acting(name: str, settings: Mapping[str, Any], root: Path, environments: int
         chunk, config.n_action_steps, lead = config.n_action_steps, 1, WARM_UP
         if name == "diffusion":
             passes, config.num_inference_steps = config.num_train_timesteps, 1
-            calls = min(calls, 3 * lead)
+            calls = min(calls, 4)
         policy = get_policy_class(name)(config).to(config.device).eval()
     observation = torch.zeros(environments, 4, device=policy.config.device)
     batch = {OBS_STATE: observation, OBS_ENV_STATE: observation, RETURN_SO_FAR: observation[:, :1]}
