@@ -181,6 +181,16 @@ def make_parser() -> argparse.ArgumentParser:
     measure.add_argument("--output", type=Path, help="write the record here as JSON")
     measure.set_defaults(run=_measure)
 
+    bench = commands.add_parser(
+        "bench", help="how fast this machine reads, trains, acts, evaluates and builds", allow_abbrev=False
+    )
+    bench.add_argument("--configs", type=Path, default=Path("configs"), metavar="DIR", help="default: %(default)s")
+    bench.add_argument("--quick", action="store_true", help="everything once, in a minute: numbers of no worth")
+    bench.add_argument(
+        "--output", type=Path, required=True, metavar="FILE.json", help="the record; a picture goes beside it"
+    )
+    bench.set_defaults(run=_bench)
+
     for name, what, run in (
         ("heatmap", "the paper's DoorKey heatmap: a grid of runs, shared by workers", _heatmap),
         ("table", "the paper's Maze2D table: a grid of runs, shared by workers", _table),
@@ -549,6 +559,19 @@ def _measure(arguments: argparse.Namespace) -> None:
     if arguments.output:
         _write_record(record, arguments.output)
         print(f"written to {arguments.output}")
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask import plots
+    from lerobot_unimask.experiments.bench import bench, markdown
+
+    record = bench(arguments.configs, quick=arguments.quick)
+    record["command"] = arguments.text
+    print(markdown(record))
+    _write_record(record, arguments.output)
+    picture = arguments.output.with_suffix(".png")
+    plots.cost_of_growth(record).savefig(picture, dpi=200)
+    print(f"written to {arguments.output} and {picture}")
 
 
 def _curve(arguments: argparse.Namespace) -> None:

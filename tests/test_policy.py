@@ -3,6 +3,7 @@
 import copy
 import json
 import logging
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -12,6 +13,8 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from safetensors.torch import load_file, save_file
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from lerobot_unimask import TASKS, MaskError, UniMASKConfig, UniMASKPolicy, Window
 from lerobot_unimask.inference import ORDERS
@@ -210,6 +213,47 @@ def test_validation_masks_are_the_same_at_every_update(tiny_policy, doorkey_batc
 def test_the_loss_is_the_weighted_sum_of_its_parts(tiny_policy, doorkey_batch):
     loss, parts = tiny_policy(loss_weights={"s": 0.25}).forward(doorkey_batch)
     assert loss.item() == pytest.approx(0.25 * parts["loss_s"] + parts["loss_a"], rel=1e-5)
+
+
+class OnOneDevice(TorchDispatchMode):
+    """Fails where an operation reads or makes a tensor that is not on this device."""
+
+    def __init__(self, device):
+        super().__init__()
+        self.device = device
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        tensors = [leaf for leaf in tree_leaves((args, kwargs, result)) if isinstance(leaf, torch.Tensor)]
+        assert all(tensor.device.type == self.device for tensor in tensors), function
+        return result
+
+
+@pytest.mark.parametrize("causal_draw", ["window", "update"])
+@pytest.mark.parametrize("masks", ["random_mask", ["multi_task", "random_mask"]])
+def test_between_batch_and_gradient_nothing_crosses_between_host_and_device(
+    tiny_policy, kind, batch_of, masks, causal_draw, monkeypatch
+):
+    """On PyTorch's meta device, whose tensors hold no values: reading one on the host is an error there."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
+    policy = tiny_policy(kind, training_masks=masks, causal_draw=causal_draw).to("meta").train()
+    batch = {key: value.to("meta") for key, value in batch_of(kind).items() if isinstance(value, torch.Tensor)}
+    with OnOneDevice("meta"):
+        loss, parts = policy(batch)
+        loss.backward()
+    assert set(parts) == {"loss_s", "loss_a"}
+    with pytest.raises(RuntimeError, match="meta"), OnOneDevice("meta"):  # what the test is made to find
+        loss.item()
+
+
+def test_the_parts_of_a_loss_survive_mixed_precisions_wrapper(tiny_policy, doorkey_batch):
+    """accelerate makes anew each mapping that a model returns."""
+    from accelerate.utils import convert_outputs_to_fp32
+
+    policy = tiny_policy()
+    plain, wrapped = policy(doorkey_batch)[1], convert_outputs_to_fp32(policy.forward)(doorkey_batch)[1]
+    assert dict(plain) == dict(wrapped)
+    assert all(isinstance(part, float) for part in plain.values())
 
 
 def test_padding_does_not_matter_to_the_loss(tiny_policy, continuous_batch):
