@@ -48,9 +48,9 @@ from lerobot_unimask.envs.maze2d import Maze2DEnv
 from lerobot_unimask.experiments import learning_curve
 from lerobot_unimask.experiments.study import versions
 from lerobot_unimask.experiments.training import Trainer
-from lerobot_unimask.masks import TrainingMasks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.transformer import Transformer
+from lerobot_unimask.training_masks import TrainingMasks
 from lerobot_unimask.window import RETURN_SO_FAR
 
 WARM_UP = 2  # updates or calls that do not count
