@@ -361,4 +361,4 @@ def _open(name: str, storage: str, heartbeat: int) -> optuna.Study:
     except sqlalchemy.exc.ArgumentError as error:
         raise ValueError(f"--storage={kind} is no database's URL, such as postgresql://ME@HOST/NAME.") from error
     except sqlalchemy.exc.OperationalError as error:
-        raise ConnectionError(f"--storage={kind}:... does not answer: {error.orig}") from error
+        raise ConnectionError(f"--storage={kind}:... does not answer: {str(error.orig).splitlines()[0]}") from error
