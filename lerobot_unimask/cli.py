@@ -191,20 +191,21 @@ def make_parser() -> argparse.ArgumentParser:
     )
     bench.set_defaults(run=_bench)
 
-    for name, what, run in (
-        ("heatmap", "the paper's DoorKey heatmap: a grid of runs, shared by workers", _heatmap),
-        ("table", "the paper's Maze2D table: a grid of runs, shared by workers", _table),
-        ("ablation", "what earns its place: variants of one Maze2D model at equal updates", _ablation),
-    ):
-        grid = commands.add_parser(name, help=what, allow_abbrev=False)
-        grid.add_argument("--config_path", type=Path, required=True, metavar="YAML", help="as in configs/")
-        grid.add_argument("--workers", type=_positive, default=1, help="processes to start here; default: %(default)s")
-        grid.add_argument(
+    for name, what in {
+        "heatmap": "the paper's DoorKey heatmap: a grid of runs, shared by workers",
+        "table": "the paper's Maze2D table: a grid of runs, shared by workers",
+        "search": "the paper's random search for hyperparameters: runs shared by workers",
+        "ablation": "what earns its place: variants of one Maze2D model at equal updates",
+    }.items():
+        study = commands.add_parser(name, help=what, allow_abbrev=False)
+        study.add_argument("--config_path", type=Path, required=True, metavar="YAML", help="as in configs/")
+        study.add_argument("--workers", type=_positive, default=1, help="processes to start here; default: %(default)s")
+        study.add_argument(
             "--storage",
             metavar="URL",
             help="database that the study is kept in, such as postgresql://...; default: an SQLite file in the output",
         )
-        grid.set_defaults(run=run)
+        study.set_defaults(run=_study)
 
     push = commands.add_parser(
         "push", help="push a saved policy or a dataset to the Hub, or finish such a push", allow_abbrev=False
@@ -516,31 +517,19 @@ def _validate(arguments: argparse.Namespace) -> None:
         print(f"written to {arguments.output}")
 
 
-def _heatmap(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments.heatmap import HeatmapConfig, heatmap, markdown
+def _study(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.experiments import ablation, heatmap, search, table
     from lerobot_unimask.experiments.study import read_config
 
-    config = read_config(HeatmapConfig, arguments.config_path)
-    print(markdown(heatmap(config, storage=arguments.storage, workers=arguments.workers)))
-    print(f"written to {config.output}: heatmap.json, heatmap.md and a picture for each number of episodes")
-
-
-def _table(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments.study import read_config
-    from lerobot_unimask.experiments.table import TableConfig, markdown, table
-
-    config = read_config(TableConfig, arguments.config_path)
-    print(markdown(table(config, storage=arguments.storage, workers=arguments.workers)))
-    print(f"written to {config.output}: table.json and table.md")
-
-
-def _ablation(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments.ablation import AblationConfig, ablation, markdown
-    from lerobot_unimask.experiments.study import read_config
-
-    config = read_config(AblationConfig, arguments.config_path)
-    print(markdown(ablation(config, storage=arguments.storage, workers=arguments.workers)))
-    print(f"written to {config.output}: {config.name}.json and {config.name}.md")
+    kind, run, markdown = {
+        "heatmap": (heatmap.HeatmapConfig, heatmap.heatmap, heatmap.markdown),
+        "table": (table.TableConfig, table.table, table.markdown),
+        "search": (search.SearchConfig, search.search, search.markdown),
+        "ablation": (ablation.AblationConfig, ablation.ablation, ablation.markdown),
+    }[arguments.command]
+    config = read_config(kind, arguments.config_path)
+    print(markdown(run(config, storage=arguments.storage, workers=arguments.workers)))
+    print(f"written to {config.output}")
 
 
 def _measure(arguments: argparse.Namespace) -> None:

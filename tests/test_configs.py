@@ -13,6 +13,7 @@ from lerobot_unimask import UniMASKConfig
 from lerobot_unimask.cli import make_parser
 from lerobot_unimask.experiments.ablation import AblationConfig
 from lerobot_unimask.experiments.heatmap import HeatmapConfig
+from lerobot_unimask.experiments.search import SearchConfig, draw, nested
 from lerobot_unimask.experiments.study import read_config
 from lerobot_unimask.experiments.table import TableConfig
 from lerobot_unimask.masks import tabulate
@@ -22,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 CONFIGS = sorted(path.relative_to(ROOT) for path in ROOT.glob("configs/*.yaml"))
 TRAINING = [path for path in CONFIGS if "dataset" in yaml.safe_load((ROOT / path).read_text())]
 GRIDS = [path for path in CONFIGS if path not in TRAINING]
-GRID_OF = {"ablation": AblationConfig, "heatmap": HeatmapConfig, "table": TableConfig}
+GRID_OF = {"ablation": AblationConfig, "heatmap": HeatmapConfig, "search": SearchConfig, "table": TableConfig}
 
 training = pytest.mark.parametrize("path", TRAINING, ids=str)
 
@@ -89,5 +90,7 @@ def test_a_grid_opens_with_its_command_which_reads_it(path: Path) -> None:
     config = read_config(GRID_OF[arguments.command], ROOT / path)
     assert config.name == path.stem
     variants = getattr(config, "variants", {"all": {}})
+    drawn = [nested(settings) for settings in draw(getattr(config, "space", {}), getattr(config, "draws", 1))]
     for settings in variants.values():
-        UniMASKConfig(**{**config.policy, **settings})
+        for more in drawn:
+            UniMASKConfig(**{**config.policy, **settings, **{k: v for k, v in more.items() if k != "batch_size"}})

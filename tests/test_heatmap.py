@@ -10,6 +10,7 @@ from lerobot_unimask.experiments.heatmap import (
     FINETUNE,
     ROWS,
     HeatmapConfig,
+    figures,
     heatmap,
     markdown,
     optimum_losses,
@@ -67,7 +68,8 @@ def test_every_row_has_the_tasks_that_it_answers(config, record):
     json.dumps(record, allow_nan=False)
     output = Path(config.output)
     assert json.loads((output / "heatmap.json").read_text())["losses"] == record["losses"]
-    assert (output / "heatmap_20.png").stat().st_size > 10_000
+    for name in ("heatmap_20.png", "heatmap_20_raw.png"):
+        assert (output / name).stat().st_size > 10_000
 
 
 def test_a_cell_is_what_validate_finds_of_the_kept_weights(config, record):
@@ -91,21 +93,40 @@ def test_the_optimum_is_below_every_model(config, record):
         assert all(cell["mean"] > record["optimum"][task] for task, cell in tasks.items())
 
 
-def test_tables_show_the_difference_from_the_papers_numbers():
+def made_up(episodes: int) -> dict:
+    """A record of two rows, of which one has no number for the past."""
     cell = {task: {"mean": 1.5, "spread": 0.0, "seeds": 1} for task in TASKS}
     other = {task: {"mean": 3.0, "spread": 0.0, "seeds": 1} for task in TASKS if task != "past"}
     config = {
         "expert": "released", "validation_episodes": 1, "seeds": [0], "steps": 1, "batch_size": 1,
         "evaluate_every": 1, "finetune_steps": 1,
     }  # fmt: skip
-    text = markdown(
-        {"config": config, "losses": {"500": {"random_mask": cell, "other": other}}, "optimum": dict.fromkeys(TASKS, 1)}
-    )
+    losses = {str(episodes): {"random_mask": cell, "other": other}}
+    return {"config": config, "losses": losses, "optimum": dict.fromkeys(TASKS, 1)}
+
+
+def test_tables_show_the_difference_from_the_papers_numbers():
+    text = markdown(made_up(500))
     assert paper_losses(500)["random_mask"]["past"] == 4.95
     assert paper_losses(7) is None
     assert "| `random_mask` | 1.500 (+0.31) | 1.500 (+0.36) |" in text
     assert "| `other` | 3.000 | 3.000 | 3.000 | 3.000 |  | 3.000 |" in text
     assert "| `other` | 2.00 | 2.00 | 2.00 | 2.00 |  | 2.00 |" in text
+    assert "| `optimum` | 0.67 | 0.67 |" in text
+
+
+def test_figures_show_what_the_tables_do():
+    """Cells in the order of rows; the paper's random-mask model is the only one of its rows that is drawn here."""
+
+    def cells(figure) -> list[list[str]]:
+        return [[text.get_text() for text in axes.texts] for axes in figure.axes]
+
+    drawn = figures(made_up(500), 500)
+    assert cells(drawn["heatmap_500"]) == [8 * ["1.00"] + 7 * ["2.00"] + 8 * ["0.667"], 8 * ["1.00"]]
+    nats, difference = cells(drawn["heatmap_500_raw"])
+    assert nats == 8 * ["1.50"] + 7 * ["3.00"] + 8 * ["1.00"]
+    assert difference == [f"{1.5 - loss:+.2f}" for loss in paper_losses(500)["random_mask"].values()]
+    assert [len(figure.axes) for figure in figures(made_up(7), 7).values()] == [1, 1]  # nothing to compare with
 
 
 @pytest.mark.parametrize("name", ["heatmap", "heatmap_quick"])

@@ -122,7 +122,7 @@ variants:
   both: {{}}
   plain: {{fine_inputs: false}}
   zeros: {{}}
-zero_hidden: [zeros]
+zero_hidden: zeros
 context_lengths: [4, 6]
 seeds: [0]
 steps: 2
@@ -163,7 +163,7 @@ output: {tmp_path / "out"}
         ("seeds: []", "at least one variant"),
         ("variants: {a/b: {}}", "leave '/' out"),
         ("steps: 0", "at least 1"),
-        ("zero_hidden: [zeros]", "the variants are default"),
+        ("zero_hidden: zeros", "the variants are default"),
         ("rolouts: 3", "rolouts"),
     ],
 )

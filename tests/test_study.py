@@ -2,9 +2,11 @@
 
 import json
 import multiprocessing
+import os
 import random
 import time
 import uuid
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -77,53 +79,87 @@ def test_a_record_whose_worker_died_before_it_could_say_so_counts(tmp_path):
     assert run_study("test", RUNS[:1], partial(sleep, 0), output=tmp_path) == [kept]
 
 
+def test_a_record_that_a_worker_on_another_machine_stored_before_it_died_counts(tmp_path):
+    """The trial that takes up a dead worker's has its attributes; its files are elsewhere."""
+    kept = {**RUNS[0], "loss": 7.0, "token": "kept", "wall_seconds": 1.0}
+    study = module._open("test", f"sqlite:///{(tmp_path / 'study.db').resolve()}", 1)
+    study.add_trial(optuna.create_trial(state=TrialState.WAITING, user_attrs={"run": RUNS[0], "record": kept}))
+    assert run_study("test", RUNS[:1], partial(sleep, 0), output=tmp_path) == [kept]
+    assert tokens(tmp_path) == {key(RUNS[0]): "kept"}
+
+
 def test_what_two_machines_enqueue_at_once_is_done_once(tmp_path):
     output = tmp_path
     (output / "runs").mkdir()
     study = module._open("test", f"sqlite:///{(output / 'study.db').resolve()}", 1)
     for _ in range(2):
-        study.enqueue_trial({}, user_attrs={"run": RUNS[0]})
+        module.enqueue(study, RUNS[0])
     run_study("test", RUNS[:1], partial(sleep, 0), output=output, heartbeat=1)
     assert sorted(states_of(output)["row-50-0"]) == sorted([TrialState.COMPLETE, TrialState.PRUNED])
 
 
+def sleep_and_say_so(folder: Path, run: dict) -> dict:
+    """While it lasts, a file is named after the process."""
+    (folder / str(os.getpid())).touch()
+    record = sleep(0.4, run)
+    (folder / str(os.getpid())).unlink()
+    return record
+
+
 def test_killing_workers_loses_no_finished_run_and_repeats_none(tmp_path):
-    """Workers are killed at random, four in all; records that were there at a kill are the same at the end."""
+    """Workers are killed, six in all: in turns in the middle of a run and at any moment. Records that were there at a
+    kill are the same at the end."""
     rng = random.Random(0)
-    output = tmp_path
+    runs = [{"row": "row", "episodes": 50, "seed": seed} for seed in range(24)]
+    output, at_work = tmp_path / "output", tmp_path / "at_work"
+    at_work.mkdir()
+    (output / "runs").mkdir(parents=True)
     storage = f"sqlite:///{(output / 'study.db').resolve()}"
-    (output / "runs").mkdir()
     study = module._open("test", storage, 1)
-    for run in RUNS:
-        study.enqueue_trial({}, user_attrs={"run": run})
+    for run in runs:
+        module.enqueue(study, run)
     context = multiprocessing.get_context("fork")  # spawned workers would each import LeRobot first
-    arguments = ("test", storage, partial(sleep, 0.4), output, 1)
+    execute = partial(sleep_and_say_so, at_work)
 
     def start():
-        process = context.Process(target=module.work, args=arguments)
+        process = context.Process(target=module.work, args=("test", storage, execute, output, 1))
         process.start()
         return process
 
+    def wait(condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+    def one_more_is_done() -> bool:
+        return len(tokens(output)) > len(kept)
+
     workers = [start(), start()]
     kept: dict[str, str] = {}
-    for _ in range(4):
-        time.sleep(rng.uniform(0.3, 1.2))
-        killed = workers.pop(rng.randrange(len(workers)))
+    for kill in range(6):
+        wait(one_more_is_done)
+        killed = workers.pop(rng.randrange(2))
+        if kill % 2:
+            wait((at_work / str(killed.pid)).exists)
+        else:
+            time.sleep(rng.uniform(0, 0.6))
         killed.kill()
         killed.join()
         found = tokens(output)
         assert kept.items() <= found.items()
         kept = found
         workers.append(start())
-    records = run_study("test", RUNS, partial(sleep, 0.4), output=output, heartbeat=1)
+    records = run_study("test", runs, execute, output=output, heartbeat=1)
     for worker in workers:
         worker.join()
     final = tokens(output)
-    assert 0 < len(kept) < len(RUNS)  # killed in the middle
+    assert len(kept) < len(runs)  # there was something left to do
     assert kept.items() <= final.items()
     assert final == {key(record): record["token"] for record in records}
-    assert all(states.count(TrialState.COMPLETE) == 1 for name, states in states_of(output).items() if name)
-    assert any(TrialState.FAIL in states for states in states_of(output).values())  # somebody was in the middle of one
+    states = states_of(output)
+    assert all(of_one.count(TrialState.COMPLETE) == 1 for name, of_one in states.items() if name)
+    assert sum(of_one.count(TrialState.FAIL) for of_one in states.values()) >= 3  # those killed in the middle
 
 
 @pytest.mark.slow  # each worker imports LeRobot
@@ -139,3 +175,17 @@ def test_the_storage_may_be_another_database(tmp_path):
     run_study("test", RUNS[:1], partial(sleep, 0), output=tmp_path / "out", storage=storage)
     assert len(optuna.load_study(study_name="test", storage=storage).trials) == 1
     assert not (tmp_path / "out" / "study.db").exists()
+
+
+@pytest.mark.parametrize(
+    ("storage", "error", "message"),
+    [
+        ("postgresql+psycopg://me:secret@localhost/x", ValueError, "needs a driver that is not installed"),
+        ("a file", ValueError, "no database's URL"),
+        ("sqlite:////no/such/folder/study.db", OSError, "sqlite:... does not answer"),
+    ],
+)
+def test_a_storage_that_cannot_be_opened_is_named_without_its_password(tmp_path, storage, error, message):
+    with pytest.raises(error, match=message) as raised:
+        run_study("test", RUNS[:1], partial(sleep, 0), output=tmp_path, storage=storage)
+    assert "secret" not in str(raised.value)

@@ -4,8 +4,6 @@ A variant is a set of policy settings. Every run trains one model, rolls it out 
 well it predicts unseen actions, how far ahead it sees, whether its directions agree, and what it costs.
 """
 
-import json
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -13,57 +11,44 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-from lerobot.policies.factory import make_pre_post_processors
-
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import plots
-from lerobot_unimask.experiments.learning_curve import rollouts
 from lerobot_unimask.experiments.measures import latency, measure
-from lerobot_unimask.experiments.study import Run, key, run_study
-from lerobot_unimask.experiments.training import Trainer
-
-QUESTIONS = ("behavior_cloning", "reward_conditioned")
+from lerobot_unimask.experiments.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
+from lerobot_unimask.experiments.table import QUESTIONS, maze_returns, mean_return
+from lerobot_unimask.experiments.training import Trainer, save
 
 
 @dataclass
-class AblationConfig:
+class AblationConfig(VariantsConfig):
     """A grid of runs, as its YAML file gives it."""
 
     name: str = "ablation"
-    # Of the study: runs of the same name in the same storage are shared.
-    variants: dict[str, dict[str, Any]] = field(default_factory=lambda: {"default": {}})
-    # Name -> settings of the policy that differ from `policy`.
-    zero_hidden: list[str] = field(default_factory=list)
-    # Variants in which hidden tokens are embedded as zeros, which is no setting of the policy.
+    zero_hidden: str | None = None
+    # The variant in which hidden tokens are embedded as zeros, which is no setting of the policy.
     context_lengths: list[int] = field(default_factory=lambda: [10])
-    seeds: list[int] = field(default_factory=lambda: [0, 1])
     steps: int = 2000
-    batch_size: int = 100
     episodes: int = 1000
     training_episodes: int = 900
     rollouts: int = 200
     ahead: int = 5
     # Steps that the model is asked to see ahead.
-    policy: dict[str, Any] = field(default_factory=dict)
     data: str = "data/maze2d"
-    # The dataset, which is built where it is missing.
     output: str = "outputs/ablation"
-    # Folder of the records, the table, the figure and the study's file.
 
     def __post_init__(self) -> None:
-        if not self.variants or not self.context_lengths or not self.seeds:
-            raise ValueError("An ablation needs at least one variant, context length and seed.")
-        if any("/" in name for name in self.variants):
-            raise ValueError("A variant gives its files their names: leave '/' out of it.")
-        if unknown := set(self.zero_hidden) - self.variants.keys():
-            raise ValueError(f"zero_hidden names {unknown.pop()!r}; the variants are {', '.join(self.variants)}.")
-        if min(self.steps, self.rollouts, self.training_episodes) < 1 or self.training_episodes >= self.episodes:
-            raise ValueError("steps and rollouts are at least 1, training_episodes too and fewer than episodes.")
+        super().__post_init__()
+        if self.training_episodes >= self.episodes:
+            raise ValueError(f"training_episodes is {self.training_episodes}; it must be less than {self.episodes}.")
+        if self.zero_hidden not in (None, *self.variants):
+            raise ValueError(f"zero_hidden is {self.zero_hidden!r}; the variants are {', '.join(self.variants)}.")
 
 
-def ablation(config: AblationConfig, *, storage: str | None = None, workers: int = 1, **study: Any) -> dict[str, Any]:
-    """Do what is left of the grid; write `NAME.json`, `NAME.md` and `NAME.png`.
+def ablation(config: AblationConfig, **study: Any) -> dict[str, Any]:
+    """Do what is left of the grid; write `NAME.json` and `NAME.md`, and of several context lengths `NAME.png`.
+
+    Args:
+        study: storage and workers, as `run_study` takes them.
 
     Returns:
         The record that the JSON holds.
@@ -78,22 +63,14 @@ def ablation(config: AblationConfig, *, storage: str | None = None, workers: int
         for variant in config.variants
     ]
     output = Path(config.output)
-    axes = ("name", "variants", "zero_hidden", "context_lengths", "seeds", "output")
-    settings = {name: value for name, value in asdict(config).items() if name not in axes}
-    settings |= {
-        f"variants.{name}": variant | {"zero_hidden": name in config.zero_hidden}
-        for name, variant in config.variants.items()
-    }
-    do = partial(run_study, config.name, runs, partial(execute, config), output=output, settings=settings)
-    records = do(storage=storage, workers=workers, **study)
+    records = run_study(config.name, runs, partial(execute, config), output=output, settings=config.settings(), **study)
     record = {
         "what": "return of LeRobot's evaluation, most likely actions; error of the predicted state some steps ahead",
         "config": asdict(config),
         "summary": summary(records),
         "runs": records,
     }
-    (output / f"{config.name}.json").write_text(json.dumps(record, indent=2) + "\n")
-    (output / f"{config.name}.md").write_text(markdown(record))
+    write_results(output, config.name, record, markdown(record))
     if len(config.context_lengths) > 1:
         plots.cost_of_context(record).savefig(output / f"{config.name}.png", dpi=200)
     return record
@@ -112,7 +89,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         batch_size=config.batch_size,
         episodes=list(range(config.training_episodes)),
     )
-    if run["row"] in config.zero_hidden:
+    if run["row"] == config.zero_hidden:
         for embedding in trainer.policy.network.embeddings.values():
             embedding.hidden.requires_grad_(False).zero_()
     began = time.process_time()
@@ -120,22 +97,14 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
     seconds = time.process_time() - began
     policy = trainer.policy.eval()
     saved = Path(config.output) / "checkpoints" / key(run)
-    policy.save_pretrained(saved)
-    for processor in make_pre_post_processors(policy.config):
-        processor.save_pretrained(saved)
-    returns = {}
-    for question in QUESTIONS:
-        asked = {"inference_mask": question, "target_return": "auto" if question == "reward_conditioned" else None}
-        returns[question] = rollouts(
-            saved, "maze2d", config.rollouts, batch_size=min(100, config.rollouts), seed=100_000, **asked
-        )
+    save(policy, saved)
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),
-        "returns": returns,
+        "returns": {question: maze_returns(saved, question, config.rollouts) for question in QUESTIONS.values()},
         "steps": config.steps,
         "batch_size": config.batch_size,
         "settings": settings,
-        "zero_hidden": run["row"] in config.zero_hidden,
+        "zero_hidden": run["row"] == config.zero_hidden,
         "parameters": sum(parameter.numel() for parameter in policy.network.parameters()),
         "processor_seconds_per_update": seconds / config.steps,
         "latency": latency(policy),
@@ -147,26 +116,24 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
 def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
     """Variant, with its context length -> quantity -> mean over seeds and standard error (of one seed: over rollouts,
     where it is a return)."""
-    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    found: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
-        cells = found.setdefault(f"{record['row']}, K = {record['context_length']}", {})
-        for question, result in record["returns"].items():
-            cells.setdefault(question, []).append((result["mean_return"], result["standard_error"]))
-        if "action_error" in record:
-            for question, error in record["action_error"].items():
-                cells.setdefault(f"{question}_error", []).append((error, 0.0))
-        if "ahead" in record:
-            cells.setdefault("error_ahead", []).append((record["ahead"]["model"], 0.0))
-        cells.setdefault("ms_per_update", []).append((1000 * record["processor_seconds_per_update"], 0.0))
-        cells.setdefault("latency_ms", []).append((record["latency"]["median_ms"], 0.0))
-    return {row: {name: _mean(values) for name, values in cells.items()} for row, cells in found.items()}
+        found.setdefault(f"{record['row']}, K = {record['context_length']}", []).append(record)
+    return {row: _quantities(of_seeds) for row, of_seeds in found.items()}
 
 
-def _mean(values: Sequence[tuple[float, float]]) -> dict[str, float]:
-    numbers = torch.tensor([value for value, _ in values], dtype=torch.float64)
-    n = len(numbers)
-    error = numbers.std().item() / math.sqrt(n) if n > 1 else values[0][1]
-    return {"mean": numbers.mean().item(), "standard_error": error, "seeds": n}
+def _quantities(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    quantities = {
+        question: mean_return([record["returns"][question] for record in records]) for question in records[0]["returns"]
+    }
+    for question in records[0].get("action_error", ()):
+        quantities[f"{question}_error"] = mean_over_seeds([record["action_error"][question] for record in records])
+    if "ahead" in records[0]:
+        quantities["error_ahead"] = mean_over_seeds([record["ahead"]["model"] for record in records])
+    seconds = [record["processor_seconds_per_update"] for record in records]
+    quantities["ms_per_update"] = mean_over_seeds([1000 * value for value in seconds])
+    quantities["latency_ms"] = mean_over_seeds([record["latency"]["median_ms"] for record in records])
+    return quantities
 
 
 def markdown(record: Mapping[str, Any]) -> str:

@@ -10,7 +10,6 @@ Note: The paper's losses are probably those of its authors' code (`expert=releas
 """
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -20,13 +19,15 @@ from typing import Any
 
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from dataset_builders.doorkey import build_doorkey
+from lerobot_unimask import plots
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.envs.doorkey import FPS, HORIZON
 from lerobot_unimask.experiments.optimum import FEATURES, Optimum, entropies, mean_over_asked
-from lerobot_unimask.experiments.study import Run, key, run_study
-from lerobot_unimask.experiments.training import Trainer
+from lerobot_unimask.experiments.study import Run, StudyConfig, check_rows, key, run_study, write_results
+from lerobot_unimask.experiments.training import Trainer, train_to_lowest
 from lerobot_unimask.experiments.validation import answered, first_windows, read_first_windows, task_losses
 from lerobot_unimask.masks import RANDOM_MASK, TASKS
 from lerobot_unimask.modeling_unimask import VALIDATION_STEP
@@ -56,43 +57,33 @@ ROWS: dict[str, dict[str, Any]] = {
 
 
 @dataclass
-class HeatmapConfig:
+class HeatmapConfig(StudyConfig):
     """A grid of runs, as its YAML file gives it."""
 
     name: str = "heatmap"
-    # Of the study: runs of the same name in the same storage are shared.
     rows: list[str] = field(default_factory=lambda: [*TASKS, "multi_task", RANDOM_MASK, FINETUNE])
     # What is trained: names in `ROWS`, and finetune, which needs random_mask.
     episodes: list[int] = field(default_factory=lambda: [500])
-    seeds: list[int] = field(default_factory=lambda: [0, 1])
     expert: str = "released"
-    steps: int = 4000
     finetune_steps: int = 1000
     evaluate_every: int = 250
     # Updates between validations, of which the best counts.
-    batch_size: int = 100
     validation_episodes: int = 1000
-    policy: dict[str, Any] = field(default_factory=dict)
-    # Settings of every row's policy.
     finetune_policy: dict[str, Any] = field(default_factory=dict)
     # Settings that fine-tuning changes.
     data: str = "data/heatmap"
-    # Folder of the datasets, which are built where they are missing.
     output: str = "outputs/heatmap"
-    # Folder of the records, the table, the figure and the study's file.
 
     def __post_init__(self) -> None:
-        unknown = [row for row in self.rows if row not in ROWS and row != FINETUNE]
-        if unknown:
-            raise ValueError(f"The heatmap has no row {unknown[0]!r}; its rows are {', '.join([*ROWS, FINETUNE])}.")
-        if FINETUNE in self.rows and RANDOM_MASK not in self.rows:
-            raise ValueError("The row finetune goes on from random_mask: add that row too.")
-        if min(self.steps, self.finetune_steps, self.evaluate_every, *self.episodes) < 1:
-            raise ValueError("steps, finetune_steps, evaluate_every and episodes must each be at least 1.")
+        super().__post_init__()
+        check_rows(self.rows, ROWS, {FINETUNE: RANDOM_MASK})
 
 
-def heatmap(config: HeatmapConfig, *, storage: str | None = None, workers: int = 1, **study: Any) -> dict[str, Any]:
-    """Do what is left of the grid; write `heatmap.json`, `heatmap.md` and a figure for each number of episodes.
+def heatmap(config: HeatmapConfig, **study: Any) -> dict[str, Any]:
+    """Do what is left of the grid; write `heatmap.json`, `heatmap.md` and two figures for each number of episodes.
+
+    Args:
+        study: storage and workers, as `run_study` takes them.
 
     Returns:
         The record that `heatmap.json` holds.
@@ -113,12 +104,12 @@ def heatmap(config: HeatmapConfig, *, storage: str | None = None, workers: int =
         for task in (TASKS if FINETUNE in config.rows else ())
     ]
     output = Path(config.output)
-    axes = ("name", "rows", "episodes", "seeds", "output")
-    settings = {name: value for name, value in asdict(config).items() if name not in axes}
-    share = partial(run_study, config.name, output=output, settings=settings, storage=storage, workers=workers, **study)
-    records = share(runs=first, execute=partial(execute, config))
+    share = partial(
+        run_study, config.name, execute=partial(execute, config), output=output, settings=config.settings(), **study
+    )
+    records = share(runs=first)
     if second:  # needs the first ones' weights
-        records += share(runs=second, execute=partial(execute, config))
+        records += share(runs=second)
     record = {
         "what": "validation loss in nats, its mean over seeds; one window from each episode's first step, t uniform",
         "config": asdict(config),
@@ -129,10 +120,10 @@ def heatmap(config: HeatmapConfig, *, storage: str | None = None, workers: int =
         },
         "runs": records,
     }
-    (output / "heatmap.json").write_text(json.dumps(record, indent=2) + "\n")
-    (output / "heatmap.md").write_text(markdown(record))
+    write_results(output, "heatmap", record, markdown(record))
     for episodes in config.episodes:
-        figure(record, episodes).savefig(output / f"heatmap_{episodes}.png", dpi=150)
+        for name, figure in figures(record, episodes).items():
+            figure.savefig(output / f"{name}.png", dpi=200)
     return record
 
 
@@ -144,7 +135,6 @@ def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
         settings = {"training_masks": run["task"], **config.finetune_policy}
     else:
         settings |= ROWS[run["row"]]
-    steps = config.finetune_steps if tuned else config.steps
     before = _checkpoint(config, run) if tuned else None
     if before and not before.exists():
         raise FileNotFoundError(f"{before} is not here: the random-mask model was trained on another machine.")
@@ -152,26 +142,13 @@ def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
         settings,
         _training_root(config, run["episodes"]),
         seed=run["seed"],
-        steps=steps,
+        steps=config.finetune_steps if tuned else config.steps,
         batch_size=config.batch_size,
         checkpoint=before,
     )
     policy = trainer.policy
     batch = first_windows(policy, _validation_root(config), "local/validation")
-    own = policy.training_masks.weights
-
-    def validate() -> float:
-        losses = task_losses(policy, batch, own)
-        return sum(weight * losses[text] for text, weight in own.items()) / sum(own.values())
-
-    curve: dict[int, float] = {0: validate()} if tuned else {}
-    best = {name: value.clone() for name, value in policy.state_dict().items()}
-    for done, _ in enumerate(trainer, start=1):
-        if done % config.evaluate_every == 0 or done == steps:
-            curve[done] = validate()
-            if curve[done] == min(curve.values()):
-                best = {name: value.clone() for name, value in policy.state_dict().items()}
-    policy.load_state_dict(best)
+    curve = train_to_lowest(trainer, batch, every=config.evaluate_every, count_start=tuned)
     if run["row"] == RANDOM_MASK:
         policy.save_pretrained(_checkpoint(config, run))
     tasks = [run["task"]] if tuned else [task for task in answered(policy, batch) if task in TASKS]
@@ -180,7 +157,7 @@ def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
         "updates": min(curve, key=curve.get),
         "losses": task_losses(policy, batch, tasks),
         "curve": curve,
-        "steps": steps,
+        "steps": trainer.steps,
         "batch_size": config.batch_size,
         "expert": config.expert,
         "settings": settings,
@@ -241,7 +218,8 @@ def markdown(record: Mapping[str, Any]) -> str:
             text.append(_row(row, [_cell(tasks.get(task), paper.get(row, {}).get(task)) for task in TASKS]))
         text.append(_row("optimum", [f"{record['optimum'][task]:.3f}" for task in TASKS]))
         text += ["\nDivided by the lowest of each column:\n", _header(), "| --- " * (1 + len(TASKS)) + "|"]
-        for row, values in zip(rows, _normalised(rows), strict=True):
+        over_lowest = _normalised(_grid([*_means(rows), record["optimum"]])).tolist()
+        for row, values in zip([*rows, "optimum"], over_lowest, strict=True):
             text.append(_row(row, ["" if math.isnan(value) else f"{value:.2f}" for value in values]))
     return "\n".join(text) + "\n"
 
@@ -260,32 +238,42 @@ def _cell(ours: Mapping[str, float] | None, paper: float | None) -> str:
     return f"{ours['mean']:.3f}" + (f" ({ours['mean'] - paper:+.2f})" if paper is not None else "")
 
 
-def _normalised(rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[list[float]]:
-    """Each row's losses over the lowest in their column, as in the paper's figure; NaN where there is none."""
-    values = torch.tensor([[tasks.get(task, {}).get("mean", math.nan) for task in TASKS] for tasks in rows.values()])
-    lowest = values.nan_to_num(math.inf).min(0).values
-    return (values / lowest).tolist()
+def _means(rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[dict[str, float]]:
+    return [{task: cell["mean"] for task, cell in tasks.items()} for tasks in rows.values()]
 
 
-def figure(record: Mapping[str, Any], episodes: int) -> Figure:
-    """The losses over the lowest of each column as colours, the losses themselves as numbers."""
+def _grid(rows: Sequence[Mapping[str, float]]) -> Tensor:
+    """(rows, tasks); NaN where there is no number."""
+    return torch.tensor([[losses.get(task, math.nan) for task in TASKS] for losses in rows])
+
+
+def _normalised(losses: Tensor) -> Tensor:
+    """(rows, tasks) over the lowest in each column, as in the paper's figure; the last row is the optimum, no model."""
+    return losses / losses[:-1].nan_to_num(math.inf).min(0).values
+
+
+def figures(record: Mapping[str, Any], episodes: int) -> dict[str, Figure]:
+    """Name -> figure: `heatmap_N`, as the paper's, of losses over the lowest of their column, and `heatmap_N_raw` in
+    nats. Where there are the paper's numbers, they stand beside the one, the difference from them beside the other."""
     rows = record["losses"][str(episodes)]
-    normalised = torch.tensor(_normalised(rows))
-    picture = Figure(figsize=(2 + 1.1 * len(TASKS), 1.8 + 0.42 * len(rows)), layout="constrained")
-    axes = picture.subplots()
-    image = axes.imshow(normalised.clamp(max=2).numpy(), vmin=1, vmax=2, cmap="viridis_r", aspect="auto")
-    for i, tasks in enumerate(rows.values()):
-        for j, task in enumerate(TASKS):
-            if task in tasks:
-                colour = "white" if normalised[i, j] > 1.5 else "black"
-                axes.text(j, i, f"{tasks[task]['mean']:.3g}", ha="center", va="center", color=colour, fontsize=9)
-    axes.set_xticks(range(len(TASKS)), [task.replace("_", "\n") for task in TASKS], fontsize=8)
-    axes.set_yticks(range(len(rows)), [row.replace("_", " ") for row in rows], fontsize=9)
-    axes.set_xlabel("evaluated on")
-    axes.set_ylabel("trained on")
-    axes.set_title(f"Validation loss in nats, {episodes} episodes", fontsize=10)
-    picture.colorbar(image, ax=axes, label="over the lowest of the column", extend="max")
-    return picture
+    published = paper_losses(episodes) or {}
+    losses = _grid([*_means(rows), record["optimum"]])
+    paper = _grid([*(published.get(row, {}) for row in rows), {}])
+    panels = {
+        "": [
+            plots.Panel(f"{episodes} episodes: loss over the lowest of its column", _normalised(losses)),
+            plots.Panel("the paper's", _normalised(paper)),
+        ],
+        "_raw": [
+            plots.Panel(f"{episodes} episodes: loss in nats", losses, colours=_normalised(losses)),
+            plots.Panel("minus the paper's", losses - paper, signed=True),
+        ],
+    }
+    names, tasks = ([name.replace("_", " ") for name in some] for some in ([*rows, "optimum"], TASKS))
+    return {
+        f"heatmap_{episodes}{kind}": plots.heatmaps([p for p in some if p.numbers.isfinite().any()], names, tasks)
+        for kind, some in panels.items()
+    }
 
 
 def _build(config: HeatmapConfig, root: Path, episodes: int, *, seed: int) -> None:

@@ -15,16 +15,19 @@ import os
 import platform
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import draccus
 import optuna
+import sqlalchemy
 import torch
 import yaml
+from optuna.distributions import BaseDistribution
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
 
@@ -35,6 +38,79 @@ HEARTBEAT = 15  # seconds; a worker counts as dead after four
 _OPEN = (TrialState.WAITING, TrialState.RUNNING)
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass
+class StudyConfig:
+    """What every study's YAML file says; each kind of study adds its own. Lists are the grid, which may grow.
+
+    Raises:
+        ValueError: a list that is empty, or a count below 1.
+    """
+
+    name: str = "study"
+    # Runs of the same name in the same storage are shared.
+    seeds: list[int] = field(default_factory=lambda: [0, 1])
+    steps: int = 4000
+    # Updates of a run.
+    batch_size: int = 100
+    policy: dict[str, Any] = field(default_factory=dict)
+    # Settings of every run's policy.
+    data: str = "data/study"
+    # Folder of the dataset or datasets, which are built where they are missing.
+    output: str = "outputs/study"
+    # Folder of the records, checkpoints, tables and figures, and of the study's file.
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value == []:
+                raise ValueError(f"{name} is empty; it needs at least one entry.")
+            if isinstance(value, int) and value < 1:
+                raise ValueError(f"{name} is {value}; it must be at least 1.")
+
+    def settings(self) -> dict[str, Any]:
+        """All that a run's record depends on besides the run itself."""
+        settings = {name: value for name, value in asdict(self).items() if not isinstance(value, list)}
+        return {name: value for name, value in settings.items() if name not in ("name", "output")}
+
+
+@dataclass
+class VariantsConfig(StudyConfig):
+    """A study of several settings of the policy.
+
+    Raises:
+        ValueError: no variant, or one that cannot name files.
+    """
+
+    variants: dict[str, dict[str, Any]] = field(default_factory=lambda: {"default": {}})
+    # Name -> settings of the policy, over those of `policy`.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.variants:
+            raise ValueError("variants is empty; it needs at least one entry.")
+        if any("/" in name for name in self.variants):
+            raise ValueError("A variant gives its files their names: leave '/' out of it.")
+
+    def settings(self) -> dict[str, Any]:
+        settings = super().settings()
+        return settings | {f"variants.{name}": value for name, value in settings.pop("variants").items()}
+
+
+def check_rows(rows: Sequence[str], known: Collection[str], finetuned: Mapping[str, str]) -> None:
+    """
+    Args:
+        finetuned: row -> the one whose weights it goes on from.
+
+    Raises:
+        ValueError: a row that there is not, or a fine-tuned one without the one before it.
+    """
+    names = [*known, *finetuned]
+    for row in rows:
+        if row not in names:
+            raise ValueError(f"The study has no row {row!r}; its rows are {', '.join(names)}.")
+        if row in finetuned and finetuned[row] not in rows:
+            raise ValueError(f"The row {row} goes on from {finetuned[row]}: add that row too.")
 
 
 class _Storage(RDBStorage):
@@ -71,6 +147,7 @@ def run_study(
     *,
     output: Path,
     settings: Mapping[str, Any] | None = None,
+    space: Mapping[str, BaseDistribution] | None = None,
     storage: str | None = None,
     workers: int = 1,
     heartbeat: int = HEARTBEAT,
@@ -82,6 +159,7 @@ def run_study(
         execute: does one run. With several workers it must be picklable.
         output: folder; each record goes to `output/runs/KEY.json`.
         settings: all else that the records depend on, JSON values; kept in `output/settings.json`.
+        space: what each run's `drawn` values were drawn from, which Optuna's own tools then know.
         storage: a database's URL; None: `sqlite:///OUTPUT/study.db`.
         workers: processes to start here; with 1 this process works itself.
         heartbeat: seconds.
@@ -102,7 +180,7 @@ def run_study(
     }
     for run in runs:
         if key(run) not in known:
-            study.enqueue_trial({}, user_attrs={"run": run})
+            enqueue(study, run, space)
     arguments = (name, storage, execute, output, heartbeat)
     if workers == 1:
         work(*arguments)
@@ -121,6 +199,11 @@ def run_study(
             "The same command goes on with them."
         )
     return [done[key(run)].user_attrs["record"] for run in runs]
+
+
+def enqueue(study: optuna.Study, run: Run, space: Mapping[str, BaseDistribution] | None = None) -> None:
+    drawn = {"params": run["drawn"], "distributions": dict(space)} if space else {}
+    study.add_trial(optuna.create_trial(state=TrialState.WAITING, user_attrs={"run": run}, **drawn))
 
 
 def _keep_settings(output: Path, settings: Mapping[str, Any]) -> None:
@@ -173,12 +256,15 @@ def _objective(trial: optuna.Trial, study: optuna.Study, execute: Execute, outpu
     if any(o.number < trial.number and o.state in (*_OPEN, TrialState.COMPLETE) for o in others):
         raise optuna.TrialPruned  # enqueued twice, by two machines at once
     path = output / "runs" / f"{key(run)}.json"
-    if path.exists():  # done by a worker that died before it could say so
+    if "record" in trial.user_attrs:  # done by a worker that died before it could say so
+        record = trial.user_attrs["record"]
+    elif path.exists():  # by one that died even before it could store it
         record = json.loads(path.read_text())
     else:
         began = time.monotonic()
         record = execute(run)
         record = {**run, **record, "wall_seconds": round(time.monotonic() - began, 1), "versions": versions()}
+    if not path.exists():
         _write(path, record)
     trial.set_user_attr("record", record)
     print(_progress(study, trial, record), flush=True)
@@ -213,13 +299,34 @@ def read_config[Config](kind: type[Config], path: Path) -> Config:
 
 
 def key(run: Run) -> str:
-    """A run's name: row, episodes or context length, and seed."""
-    return "-".join(str(run[name]) for name in ("row", "task", "episodes", "context_length", "seed") if name in run)
+    """A run's name: row, episodes, context length or draw, and seed."""
+    names = ("row", "task", "episodes", "context_length", "draw", "seed")
+    return "-".join(str(run[name]) for name in names if name in run)
 
 
 def key_of(trial: FrozenTrial) -> str | None:
     run = trial.user_attrs.get("run")
     return key(run) if run else None
+
+
+def write_results(output: Path, name: str, record: Mapping[str, Any], text: str) -> None:
+    """A study's record as NAME.json, its table as NAME.md."""
+    _write(output / f"{name}.json", record)
+    (output / f"{name}.md").write_text(text)
+
+
+def mean_over_seeds(values: Sequence[float], alone: float = 0.0) -> dict[str, float]:
+    """
+    Args:
+        alone: the standard error of one value.
+
+    Returns:
+        mean, standard_error, seeds.
+    """
+    numbers = torch.tensor(values, dtype=torch.float64)
+    n = len(numbers)
+    error = numbers.std().item() / math.sqrt(n) if n > 1 else alone
+    return {"mean": numbers.mean().item(), "standard_error": error, "seeds": n}
 
 
 def versions() -> dict[str, str]:
@@ -236,6 +343,22 @@ def _without_warnings() -> Iterator[None]:
 
 
 def _open(name: str, storage: str, heartbeat: int) -> optuna.Study:
+    """
+    Raises:
+        ValueError: no database's URL, or one whose driver is not installed.
+        ConnectionError: the database does not answer.
+    """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    with _without_warnings():
-        return optuna.create_study(storage=_Storage(storage, heartbeat), study_name=name, load_if_exists=True)
+    kind = storage.partition(":")[0]  # what comes after it may hold a password
+    try:
+        with _without_warnings():
+            return optuna.create_study(storage=_Storage(storage, heartbeat), study_name=name, load_if_exists=True)
+    except ImportError as error:
+        raise ValueError(
+            f"--storage={kind}:... needs a driver that is not installed ({error.__cause__ or error}). "
+            "For postgresql://: uv run --with 'psycopg[binary]' unimask ...; for mysql+pymysql://: --with pymysql."
+        ) from error
+    except sqlalchemy.exc.ArgumentError as error:
+        raise ValueError(f"--storage={kind} is no database's URL, such as postgresql://ME@HOST/NAME.") from error
+    except sqlalchemy.exc.OperationalError as error:
+        raise ConnectionError(f"--storage={kind}:... does not answer: {str(error.orig).splitlines()[0]}") from error

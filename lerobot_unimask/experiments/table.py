@@ -10,8 +10,6 @@ Note: The paper stops early by the evaluation's reward, which chooses by what is
 
 import contextlib
 import csv
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,12 +17,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask.experiments.learning_curve import rollouts
-from lerobot_unimask.experiments.study import Run, key, run_study
-from lerobot_unimask.experiments.training import Trainer
+from lerobot_unimask.experiments.study import (
+    Run,
+    StudyConfig,
+    check_rows,
+    key,
+    mean_over_seeds,
+    run_study,
+    write_results,
+)
+from lerobot_unimask.experiments.training import Trainer, save
 from lerobot_unimask.returns import read_starts
 from lerobot_unimask.window import RETURN_TO_GO, STATE
 
@@ -49,42 +53,32 @@ FINETUNED = {  # row -> the one whose weights it goes on from
 
 
 @dataclass
-class TableConfig:
+class TableConfig(StudyConfig):
     """A grid of runs, as its YAML file gives it."""
 
     name: str = "maze_table"
-    # Of the study: runs of the same name in the same storage are shared.
     rows: list[str] = field(default_factory=lambda: [*ROWS, *FINETUNED])
     context_lengths: list[int] = field(default_factory=lambda: [5, 10])
-    seeds: list[int] = field(default_factory=lambda: [0, 1])
     steps: int = 16000
     finetune_steps: int = 4000
-    batch_size: int = 100
     episodes: int = 1000
     training_episodes: int = 900
     rollouts: int = 1000
-    policy: dict[str, Any] = field(default_factory=dict)
-    # Settings of every row's policy.
     finetune_policy: dict[str, Any] = field(default_factory=dict)
     # Settings that fine-tuning changes.
     data: str = "data/maze2d"
-    # The dataset, which is built where it is missing.
     output: str = "outputs/maze_table"
-    # Folder of the records, the checkpoints, the table and the study's file.
 
     def __post_init__(self) -> None:
-        unknown = [row for row in self.rows if row not in ROWS and row not in FINETUNED]
-        if unknown:
-            raise ValueError(f"The table has no row {unknown[0]!r}; its rows are {', '.join([*ROWS, *FINETUNED])}.")
-        for row, before in FINETUNED.items():
-            if row in self.rows and before not in self.rows:
-                raise ValueError(f"The row {row} goes on from {before}: add that row too.")
-        if min(self.steps, self.finetune_steps, self.rollouts, self.training_episodes) < 1:
-            raise ValueError("steps, finetune_steps, rollouts and training_episodes must each be at least 1.")
+        super().__post_init__()
+        check_rows(self.rows, ROWS, FINETUNED)
 
 
-def table(config: TableConfig, *, storage: str | None = None, workers: int = 1, **study: Any) -> dict[str, Any]:
+def table(config: TableConfig, **study: Any) -> dict[str, Any]:
     """Do what is left of the grid; write `table.json` and `table.md`.
+
+    Args:
+        study: storage and workers, as `run_study` takes them.
 
     Returns:
         The record that `table.json` holds.
@@ -103,10 +97,9 @@ def table(config: TableConfig, *, storage: str | None = None, workers: int = 1, 
         ]
 
     output = Path(config.output)
-    axes = ("name", "rows", "context_lengths", "seeds", "output")
-    settings = {name: value for name, value in asdict(config).items() if name not in axes}
-    do = partial(run_study, config.name, execute=partial(execute, config), output=output, settings=settings)
-    share = partial(do, storage=storage, workers=workers, **study)
+    share = partial(
+        run_study, config.name, execute=partial(execute, config), output=output, settings=config.settings(), **study
+    )
     records = share(runs=runs([row for row in config.rows if row in ROWS]))
     tuned = runs([row for row in config.rows if row in FINETUNED])
     if tuned:  # needs the others' weights
@@ -120,8 +113,7 @@ def table(config: TableConfig, *, storage: str | None = None, workers: int = 1, 
         "returns": summary(records),
         "runs": records,
     }
-    (output / "table.json").write_text(json.dumps(record, indent=2) + "\n")
-    (output / "table.md").write_text(markdown(record))
+    write_results(output, "table", record, markdown(record))
     return record
 
 
@@ -148,12 +140,11 @@ def execute(config: TableConfig, run: Run) -> dict[str, Any]:
     )
     losses = list(trainer)
     saved = checkpoints / key(run)
-    trainer.policy.save_pretrained(saved)
-    _save_processors(trainer.policy, saved)
+    save(trainer.policy, saved)
     questions = QUESTIONS.values() if run["task"] == BOTH else [run["task"]]
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),
-        "returns": {question: _roll_out(config, saved, question) for question in questions},
+        "returns": {question: maze_returns(saved, question, config.rollouts) for question in questions},
         "steps": trainer.steps,
         "batch_size": config.batch_size,
         "settings": settings,
@@ -162,20 +153,11 @@ def execute(config: TableConfig, run: Run) -> dict[str, Any]:
     }
 
 
-def _save_processors(policy: Any, folder: Path) -> None:
-    """What lerobot-train saves beside the weights, for LeRobot's evaluation to load."""
-    from lerobot.policies.factory import make_pre_post_processors
-
-    for processor in make_pre_post_processors(policy.config):
-        processor.save_pretrained(folder)
-
-
-def _roll_out(config: TableConfig, checkpoint: Path, question: str) -> dict[str, Any]:
+def maze_returns(checkpoint: Path, question: str, episodes: int) -> dict[str, Any]:
+    """`rollouts` of one of `QUESTIONS`, from the same starts for every model."""
     asked = {"inference_mask": question, "target_return": "auto" if question == "reward_conditioned" else None}
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):  # LeRobot's progress bars
-        return rollouts(
-            checkpoint, "maze2d", config.rollouts, batch_size=min(100, config.rollouts), seed=100_000, **asked
-        )
+        return rollouts(checkpoint, "maze2d", episodes, batch_size=min(100, episodes), seed=100_000, **asked)
 
 
 def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
@@ -186,14 +168,12 @@ def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
         for question, result in record["returns"].items():
             column = f"k{record['context_length']}_{names[question]}"
             found.setdefault(record["row"], {}).setdefault(column, []).append(result)
-    return {row: {name: _mean(results) for name, results in columns.items()} for row, columns in found.items()}
+    return {row: {name: mean_return(results) for name, results in columns.items()} for row, columns in found.items()}
 
 
-def _mean(results: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    values = torch.tensor([result["mean_return"] for result in results], dtype=torch.float64)
-    n = len(values)
-    error = values.std().item() / math.sqrt(n) if n > 1 else results[0]["standard_error"]
-    return {"mean": values.mean().item(), "standard_error": error, "seeds": n}
+def mean_return(results: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Of one seed the standard error is that over its rollouts."""
+    return mean_over_seeds([result["mean_return"] for result in results], alone=results[0]["standard_error"])
 
 
 def paper_returns() -> dict[str, dict[str, float]]:

@@ -6,7 +6,7 @@ between updates.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,24 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
-from lerobot.policies.factory import make_policy
+from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.utils.random_utils import set_seed
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.experiments.validation import task_losses
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+
+def check_settings(names: Iterable[str]) -> None:
+    """
+    Raises:
+        ValueError: a setting that the policy does not have.
+    """
+    unknown = sorted(set(names) - {field.name for field in dataclasses.fields(UniMASKConfig)})
+    if unknown:
+        raise ValueError(f"The policy has no setting {unknown[0]!r}; UniMASKConfig says which there are.")
 
 
 class Trainer:
@@ -53,9 +65,7 @@ class Trainer:
     ):
         if not (root / "meta" / "info.json").exists():
             raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
-        unknown = sorted(settings.keys() - {field.name for field in dataclasses.fields(UniMASKConfig)})
-        if unknown:
-            raise ValueError(f"The policy has no setting {unknown[0]!r}; UniMASKConfig says which there are.")
+        check_settings(settings)
         repo_id = "local/dataset"
         meta = LeRobotDatasetMetadata(repo_id, root=root)
         if checkpoint is None:
@@ -106,3 +116,41 @@ class Trainer:
         self.scheduler.step()
         self.policy.update()
         return loss.item()
+
+
+def train_to_lowest(
+    trainer: Trainer, batch: dict[str, Tensor], *, every: int, count_start: bool = False
+) -> dict[int, float]:
+    """Train, and end with the weights that had the lowest validation loss (the paper's early stopping).
+
+    Args:
+        batch: validation windows, a LeRobot batch.
+        every: updates between validations.
+        count_start: the weights from before the first update count too.
+
+    Returns:
+        updates -> validation loss on what the policy is trained on, states and actions with weight 1.
+    """
+    policy = trainer.policy
+    weights = policy.training_masks.weights
+
+    def validate() -> float:
+        losses = task_losses(policy, batch, weights)
+        return sum(weight * losses[text] for text, weight in weights.items()) / sum(weights.values())
+
+    curve = {0: validate()} if count_start else {}
+    best = {name: value.clone() for name, value in policy.state_dict().items()}
+    for done, _ in enumerate(trainer, start=1):
+        if done % every == 0 or done == trainer.steps:
+            curve[done] = validate()
+            if curve[done] == min(curve.values()):
+                best = {name: value.clone() for name, value in policy.state_dict().items()}
+    policy.load_state_dict(best)
+    return curve
+
+
+def save(policy: UniMASKPolicy, folder: Path) -> None:
+    """Weights, config and LeRobot's processors, as its evaluation loads them."""
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(policy.config):
+        processor.save_pretrained(folder)
