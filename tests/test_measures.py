@@ -160,7 +160,7 @@ output: {tmp_path / "out"}
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("seeds: []", "at least one variant"),
+        ("seeds: []", "seeds is empty"),
         ("variants: {a/b: {}}", "leave '/' out"),
         ("steps: 0", "at least 1"),
         ("zero_hidden: zeros", "the variants are default"),
