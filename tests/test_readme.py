@@ -1,10 +1,10 @@
 """The README cannot rot: its commands and its Python are run, in short forms, and its links and numbers have sources.
 
-The fenced blocks of README.md marked `bash` and `python` are cases in the order in which they stand, named by their
-line, and run in one folder that holds nothing but a copy of `configs/`; each may need what those before it made, so run
-this file as a whole. A command `uv run X ...` becomes the console script X beside this Python. What makes it short is
-in `SHORT`; nothing else of it is changed. What is not run is in `NOT_RUN`, with the reason; a trailing comment with the
-word hours does the same for one line.
+The fenced blocks of README.md, then of docs/results.md, marked `bash` and `python` are cases in the order in which they
+stand, named by their line, and run in one folder that holds nothing but a copy of `configs/`; each may need what those
+before it made, so run this file as a whole. A command `uv run X ...` becomes the console script X beside this Python.
+What makes it short is in `SHORT`; nothing else of it is changed. What is not run is in `NOT_RUN`, with the reason; a
+trailing comment with the word hours does the same for one line.
 """
 
 import json
@@ -22,7 +22,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parents[1]
-README = ROOT / "README.md"
+README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
 DOCUMENTS = [README, *sorted(ROOT.glob("docs/*.md"))]
 SECONDS = 240  # for one command, on a busy machine
 
@@ -147,17 +147,19 @@ def _short_training(flags: dict[str, str]) -> dict[str, Any]:
     return SMALL if "--policy.type" in flags else {}
 
 
-BLOCKS = read_blocks(README.read_text())
-CASES: list[Command | Block] = [
-    case
-    for block in BLOCKS
+CASES: list[tuple[Path, Command | Block]] = [
+    (document, case)
+    for document in (README, RESULTS)
+    for block in read_blocks(document.read_text())
     for case in (read_commands(block) if block.language == "bash" else [block] if block.language == "python" else [])
 ]
 
 
-def name(case: Command | Block) -> str:
-    text = case.text if isinstance(case, Command) else "python"
-    return f"line {case.line} {' '.join(text.split())[:60]}"
+def name(value: Path | Command | Block) -> str:
+    if isinstance(value, Path):
+        return value.name
+    text = value.text if isinstance(value, Command) else "python"
+    return f"line {value.line} {' '.join(text.split())[:60]}"
 
 
 @pytest.fixture(scope="module")
@@ -174,14 +176,14 @@ def namespace() -> dict[str, Any]:
     return {"__name__": "readme"}
 
 
-@pytest.mark.parametrize("case", CASES, ids=name)
+@pytest.mark.parametrize(("document", "case"), CASES, ids=name)
 def test_what_the_readme_says_works(
-    case: Command | Block, folder: Path, namespace: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    document: Path, case: Command | Block, folder: Path, namespace: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
     if isinstance(case, Block):
-        padding = "\n" * (case.line - 1)  # so that a traceback names the README's lines
-        exec(compile(padding + case.text, README, "exec"), namespace)
+        padding = "\n" * (case.line - 1)  # so that a traceback names the document's lines
+        exec(compile(padding + case.text, document, "exec"), namespace)
     elif case.reason_not_to_run:
         pytest.skip(case.reason_not_to_run)
     else:
