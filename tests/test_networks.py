@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lerobot_unimask.losses import masked_losses
+from lerobot_unimask.networks.feedforward import FeedForward
 from lerobot_unimask.networks.transformer import Cache, NumberEncoding, Transformer, course
 from lerobot_unimask.window import Feature, Window, make_factors
 
@@ -229,20 +230,15 @@ def test_states_that_go_straight_on_are_predicted_before_anything_is_learnt():
     torch.testing.assert_close(predicted[:, 2:], values["s"][:, 2:])
 
 
-def test_the_network_learns_what_a_mask_hides():
+@pytest.mark.parametrize(
+    ("network", "settings"), [(Transformer, {"stacked": True, "heads": 2, "depth": 1}), (FeedForward, {"depth": 2})]
+)
+def test_a_network_learns_what_a_mask_hides(network, settings):
     """Forward dynamics of a ring, s[k + 1] = (s[k] + 1) mod 7, from one shown state: model and loss together."""
     torch.manual_seed(0)
     factors = make_factors({"s": [Feature("observation.state", 1, [7])], "a": [Feature("action", 1)]})
-    network = Transformer(
-        factors,
-        context_length=K,
-        stacked=True,
-        width=32,
-        depth=1,
-        heads=2,
-        feedforward_width=32,
-        dropout=0.0,
-        fine_inputs=False,
+    network = network(
+        factors, context_length=K, fine_inputs=False, width=32, feedforward_width=32, dropout=0.0, **settings
     )
     starts = torch.arange(7)
     states = ((starts[:, None] + torch.arange(K)) % 7).float().unsqueeze(-1)  # (7, K, 1)

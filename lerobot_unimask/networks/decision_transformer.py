@@ -8,12 +8,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_unimask.masks import ASKABLE
-from lerobot_unimask.networks.transformer import Block, Cache, FactorEmbedding, Predictions
+from lerobot_unimask.networks.transformer import Block, Cache, FactorEmbedding, Heads, Predictions
 from lerobot_unimask.window import Factor, Window
 
-TIMESTEPS = (
-    1000  # rows of the timestep embedding, as in the original: an episode's steps, or thousandths of a longer one
-)
+# Rows of the timestep embedding, as in the original: an episode's steps, or thousandths of a longer one
+TIMESTEPS = 1000
 
 
 class DecisionTransformer(nn.Module):
@@ -68,8 +67,7 @@ class DecisionTransformer(nn.Module):
         self.dropout = nn.Dropout(dropout)
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
-        self.sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
-        self.heads = nn.ModuleDict({name: nn.Linear(width, sum(sizes)) for name, sizes in self.sizes.items()})
+        self.heads = Heads(factors, width)
         before = torch.ones(3 * context_length, 3 * context_length, dtype=torch.bool).tril()
         self.register_buffer("before", before, persistent=False)
 
@@ -89,12 +87,8 @@ class DecisionTransformer(nn.Module):
         for block in self.blocks:
             x, _ = block(x, self.before, None)
         _, at_state, at_action = self.norm(x).unflatten(1, (-1, 3)).unbind(2)  # each (B, K, W)
-        from_tokens = {"s": functional.pad(at_action, (0, 0, 1, -1)), "a": at_state}  # of s0, nothing comes before
-        with torch.autocast(x.device.type, enabled=False):  # answers in full precision also under mixed precision
-            return {
-                name: list(self.heads[name](from_tokens[name].float()).split(sizes, dim=-1))
-                for name, sizes in self.sizes.items()
-            }
+        # Each is predicted from the token before it; before s0 there is none.
+        return self.heads({"s": functional.pad(at_action, (0, 0, 1, -1)), "a": at_state})
 
     def _embed_returns(self, window: Window, visible: dict[str, Tensor]) -> Tensor:
         """(B, K, W)"""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_unimask.masks import ASKABLE
-from lerobot_unimask.networks.transformer import Cache, FactorEmbedding, Predictions
+from lerobot_unimask.networks.transformer import Cache, FactorEmbedding, Heads, Predictions
 from lerobot_unimask.window import Factor, Window
 
 
@@ -41,7 +41,6 @@ class FeedForward(nn.Module):
         dropout: float,
     ):
         super().__init__()
-        self.context_length = context_length
         self.embeddings = nn.ModuleDict(
             {name: FactorEmbedding(factor, width, fine_inputs=fine_inputs) for name, factor in factors.items()}
         )
@@ -53,10 +52,7 @@ class FeedForward(nn.Module):
                 for before, after in pairwise(widths)
             )
         )
-        self.sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
-        self.heads = nn.ModuleDict(
-            {name: nn.Linear(feedforward_width, context_length * sum(sizes)) for name, sizes in self.sizes.items()}
-        )
+        self.heads = Heads(factors, feedforward_width, steps=context_length)
 
     def forward(
         self, window: Window, visible: dict[str, Tensor], causal: Tensor | bool = False, cache: Cache | None = None
@@ -66,9 +62,5 @@ class FeedForward(nn.Module):
         x = torch.cat(
             [token.flatten(1) if name in ASKABLE else token[:, 0] for name, token in tokens.items()], dim=1
         )  # (B, N W)
-        x = self.hidden(x)  # (B, H)
-        with torch.autocast(x.device.type, enabled=False):  # answers in full precision also under mixed precision
-            return {
-                name: list(self.heads[name](x.float()).unflatten(1, (self.context_length, -1)).split(sizes, dim=-1))
-                for name, sizes in self.sizes.items()
-            }
+        x = self.hidden(x).unsqueeze(1)  # (B, 1, H)
+        return self.heads(dict.fromkeys(ASKABLE, x))

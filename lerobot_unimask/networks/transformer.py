@@ -129,6 +129,30 @@ class FactorEmbedding(nn.Module):
         return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
 
 
+class Heads(nn.ModuleDict):
+    """A linear layer for each predicted factor. Answers are in full precision also under mixed precision.
+
+    Args:
+        width: of what they read.
+        steps: of the window, that one input of theirs speaks for.
+    """
+
+    def __init__(self, factors: dict[str, Factor], width: int, *, steps: int = 1):
+        sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
+        super().__init__({name: nn.Linear(width, steps * sum(of_factor)) for name, of_factor in sizes.items()})
+        self.sizes = sizes
+        self.steps = steps
+
+    def forward(self, x: dict[str, Tensor]) -> Predictions:
+        """factor -> (B, K / steps, W)"""
+        with torch.autocast(x["s"].device.type, enabled=False):
+            outputs = {name: head(x[name].float()) for name, head in self.items()}
+        return {
+            name: list(output.unflatten(-1, (self.steps, -1)).flatten(1, 2).split(self.sizes[name], dim=-1))
+            for name, output in outputs.items()
+        }
+
+
 @dataclass
 class Cache:
     """What causal attention has computed for a window's first n tokens: their inputs, (B, n, W), and each block's keys
@@ -226,11 +250,10 @@ class Transformer(nn.Module):
         self.dropout = nn.Dropout(dropout)
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
-        self.sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
         self.on_course = {
             i: c.dims for i, c in enumerate(factors["s"].components) if fine_inputs and not c.discrete
         }  # which of the states' components, and their dimensions
-        self.heads = nn.ModuleDict({name: nn.Linear(width, sum(sizes)) for name, sizes in self.sizes.items()})
+        self.heads = Heads(factors, width)
 
     def forward(
         self,
@@ -258,12 +281,7 @@ class Transformer(nn.Module):
         if causal is not False:  # the token before; nothing stands before the first one
             before = functional.pad(x, (0, 0, 1, -1))
             x = before if causal is True else torch.where(causal[:, None, None], before, x)
-        per_factor = dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x)
-        with torch.autocast(x.device.type, enabled=False):  # answers in full precision also under mixed precision
-            predictions = {
-                name: list(self.heads[name](per_factor[name].float()).split(sizes, dim=-1))
-                for name, sizes in self.sizes.items()
-            }
+        predictions = self.heads(dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x))
         if self.on_course:
             states = torch.where(visible["s"].unsqueeze(-1), window.values["s"], 0.0)
             ahead = course(states, visible["s"], causal)
