@@ -34,7 +34,6 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config
-from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.scripts import lerobot_train
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch.nn.attention import SDPBackend, sdpa_kernel
@@ -78,7 +77,7 @@ FULL = Size(
     repeats=5,
     batch_size=100,
     updates=100,
-    slow_updates=6,
+    slow_updates=4,
     calls=100,
     environments=(1, 10, 100),
     rollouts=1000,
@@ -172,8 +171,6 @@ def _training(size: Size, configs: Path, roots: Mapping[str, Path]) -> dict[str,
         "maze2d, mixed precision": ("maze2d", ["--policy.use_amp=true"], {}),
         "maze2d, float32, explicit attention": ("maze2d", ["--policy.use_amp=false"], {"explicit_attention": True}),
     }
-    if size is FULL:  # compiling takes most of a minute
-        variants["maze2d, float32, compiled"] = ("maze2d", ["--policy.use_amp=false"], {"compiled": True})
     found = {}
     for name, (config, arguments, changes) in variants.items():
         updates = size.slow_updates if "batched_reads" in changes else size.updates
@@ -291,7 +288,6 @@ def training(
     *,
     batched_reads: bool = True,
     explicit_attention: bool = False,
-    compiled: bool = False,
 ) -> dict[str, Any]:
     """lerobot-train itself, without checkpoints and evaluations: an update's time and what it is spent on.
 
@@ -303,7 +299,7 @@ def training(
     watch.wrap(UniMASKPolicy, "forward", "forward")
     watch.wrap(TrainingMasks, "forward", "masks")
     watch.wrap(Accelerator, "backward", "backward")
-    cycle, make = lerobot_train.cycle, lerobot_train.make_policy
+    cycle = lerobot_train.cycle
 
     def timed_cycle(loader: Any) -> Iterator[Any]:
         batches = cycle(loader)
@@ -312,14 +308,7 @@ def training(
                 batch = next(batches)
             yield batch
 
-    def make_compiled(*arguments: Any, **keywords: Any) -> PreTrainedPolicy:
-        policy = make(*arguments, **keywords)
-        policy.network.compile()
-        return policy
-
     lerobot_train.cycle = timed_cycle
-    if compiled:
-        lerobot_train.make_policy = make_compiled
     if not batched_reads:
         os.environ[reads.ENVIRONMENT_VARIABLE] = "0"
     with tempfile.TemporaryDirectory() as folder:
@@ -349,7 +338,6 @@ def training(
     return {
         "step_ms": spread(1000 * counted),
         "steps_per_second": 1 / np.median(counted),
-        "first_step_ms": 1000 * step[0],
         "share": {name: seconds[WARM_UP:].sum() / counted.sum() for name, seconds in pieces.items()},
         "threads": torch.get_num_threads(),
     }
