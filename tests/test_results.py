@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import TASKS
+from lerobot_unimask.experiments.heatmap import markdown
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -36,6 +37,19 @@ def test_500_episodes_are_no_more_than_2_percent_above_the_papers_random_mask_ro
         best = losses["optimum"]["expected_losses"][task]
         row = f"| `{task}` | {losses['mean'][task]:.3f} | {losses['spread'][task]:.3f} | {published:g} | {best:.3f} |"
         assert row in PAGES
+
+
+def test_the_heatmaps_diagonal_and_its_general_models_are_as_good_as_the_papers():
+    heatmap = record("heatmap.json")
+    assert heatmap["config"]["seeds"] == [0, 1]
+    rows = heatmap["losses"]["500"]
+    for row in (*TASKS, "random_mask", "finetune"):
+        published = paper(row)
+        for task in TASKS if row in ("random_mask", "finetune") else (row,):
+            assert rows[row][task]["seeds"] == 2
+            assert rows[row][task]["mean"] <= 1.05 * published[task], (row, task)
+    for line in markdown(heatmap).splitlines():
+        assert not re.match(r"\| `.*\(", line) or line in PAGES
 
 
 @pytest.mark.parametrize(("rule", "success", "mean_return"), [("most_likely", 80, 6.5), ("sampled", 0, 0)])
