@@ -8,6 +8,7 @@ read one by one and collated. `install()` adds this to LeRobotDataset; importing
 Shapes: N frames, B windows, K steps (one for each of a key's deltas), E episodes.
 """
 
+import math
 import operator
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -72,23 +73,45 @@ def collate_windows(batch: Sequence[Item], *, collate_fn_map: dict | None = None
 
 
 @dataclass(frozen=True)
-class Columns:
-    """The numbers of a dataset, as stored: one copy in each process that reads.
+class Column:
+    """The numbers of a column where Arrow has them, in a memory-mapped file: they are read there and not copied.
 
-    A column that Arrow has in one piece stays memory-mapped; `datasets` cuts columns every 1,000 rows, so most are not.
+    `datasets` stores a table in pieces of at most 1,000 rows, one after another in one or more files. `numbers` reaches
+    from the lowest address of a piece to the highest; other columns, and nothing at all, lie between the pieces: it is
+    only ever read at `offsets[piece] + row * size`.
     """
 
-    arrays: dict[str, np.ndarray]  # each (N, ...), in the order of an item's keys
-    dtypes: dict[str, torch.dtype]  # what LeRobot's items have: float32 for a stored float64, int64 for an int32
+    numbers: np.ndarray  # 1-D
+    offsets: np.ndarray  # (P,): where row 0 would be if all rows were in that piece
+    shape: tuple[int, ...]  # of a row
+    dtype: torch.dtype  # what LeRobot's items have: float32 for a stored float64, int64 for an int32
+
+    def take(self, rows: np.ndarray, piece: np.ndarray) -> np.ndarray:
+        """(...) rows, none outside the table, and the piece that each is in -> (..., *shape), a copy."""
+        size = math.prod(self.shape)
+        first = self.offsets[piece] + rows * size
+        return self.numbers[first[..., None] + np.arange(size)].reshape(*rows.shape, *self.shape)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a dataset, memory-mapped; what is held in memory has 24 bytes for each episode and piece."""
+
+    columns: dict[str, Column]  # in the order of an item's keys
+    pieces: np.ndarray  # (P,): the rows up to the end of each piece, the same in all columns
     starts: np.ndarray  # (E,): the value of `index` at each episode's first frame
     ends: np.ndarray  # (E,): and after its last
     tasks: np.ndarray  # task_index -> str
-    ascending: bool  # `index` grows from row to row
+
+    def __len__(self) -> int:
+        return int(self.pieces[-1])
+
+    def pieces_of(self, rows: np.ndarray) -> np.ndarray:
+        return np.searchsorted(self.pieces, rows, side="right")
 
 
-def _flat_numbers(column: pa.ChunkedArray) -> np.ndarray | None:
-    """An Arrow column of numbers or of (nested) lists of numbers as a 1-D array, row after row; None if any is null."""
-    array = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+def _flat_numbers(array: pa.Array) -> np.ndarray | None:
+    """Numbers or (nested) lists of numbers as a 1-D array, row after row; None if any is null."""
     while not array.null_count:
         if isinstance(array, pa.ExtensionArray):
             array = array.storage
@@ -99,26 +122,39 @@ def _flat_numbers(column: pa.ChunkedArray) -> np.ndarray | None:
     return None
 
 
+def _make_column(pieces: list[np.ndarray], ends: np.ndarray, row: torch.Tensor) -> Column:
+    """Pieces of a column, each 1-D, the rows up to the end of each, and one row as LeRobot reads it."""
+    size = row.numel()
+    starts = np.concatenate([[0], ends[:-1]])
+    if pieces[0].dtype == bool:  # unpacked already
+        return Column(np.concatenate(pieces), np.zeros(len(pieces), np.int64), tuple(row.shape), row.dtype)
+    addresses = np.array([piece.__array_interface__["data"][0] for piece in pieces])
+    low, high = addresses.min(), max(address + piece.nbytes for address, piece in zip(addresses, pieces, strict=True))
+    numbers = np.frombuffer(pa.foreign_buffer(low, high - low, base=pieces), pieces[0].dtype)
+    # Arrow aligns what it stores to 8 bytes, so the pieces are a whole number of numbers apart.
+    return Column(numbers, (addresses - low) // numbers.itemsize - starts * size, tuple(row.shape), row.dtype)
+
+
 def _read_columns(hf_dataset: datasets.Dataset, meta: LeRobotDatasetMetadata) -> Columns | None:
     """The columns of a dataset, or None if one of them is not plain numbers."""
     if len(hf_dataset) == 0 or hf_dataset._indices is not None:  # a selection of rows is not in the table
         return None
-    arrays, dtypes = {}, {}
-    for key, value in hf_dataset[0].items():  # one row, as LeRobot reads it, tells dtype and shape
-        if not isinstance(value, torch.Tensor):
+    batches = [batch for batch in hf_dataset.data.to_batches() if len(batch)]
+    ends = np.cumsum([len(batch) for batch in batches])
+    columns = {}
+    for key, row in hf_dataset[0].items():  # one row, as LeRobot reads it, tells dtype and shape
+        if not isinstance(row, torch.Tensor) or row.numel() == 0:
             return None
-        numbers = _flat_numbers(hf_dataset.data.column(key))
-        if numbers is None or numbers.size != len(hf_dataset) * value.numel():
+        pieces = [_flat_numbers(batch.column(key)) for batch in batches]
+        if any(p is None or len(p) != len(batch) * row.numel() for p, batch in zip(pieces, batches, strict=True)):
             return None
-        arrays[key] = numbers.reshape(len(hf_dataset), *value.shape)
-        dtypes[key] = value.dtype
+        columns[key] = _make_column(pieces, ends, row)
     return Columns(
-        arrays,
-        dtypes,
-        starts=_flat_numbers(meta.episodes.data.column("dataset_from_index")),
-        ends=_flat_numbers(meta.episodes.data.column("dataset_to_index")),
+        columns,
+        ends,
+        starts=meta.episodes.data.column("dataset_from_index").to_numpy(),
+        ends=meta.episodes.data.column("dataset_to_index").to_numpy(),
         tasks=meta.tasks.index.to_numpy(dtype=object),
-        ascending=bool((arrays["index"][1:] > arrays["index"][:-1]).all()),
     )
 
 
@@ -133,36 +169,41 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
 
     Raises:
         IndexError: an index outside the dataset.
-        KeyError: a step that the metadata place in an episode is not among the loaded frames.
+        KeyError: a step that the metadata place in an episode is not among the loaded frames, or not in its place.
     """
-    index, size = columns.arrays["index"], len(columns.arrays["index"])
     rows = np.fromiter(map(operator.index, indices), dtype=np.int64)  # (B,)
+    size = len(columns)
     outside = rows[(rows < -size) | (rows >= size)]
     if len(outside):
         raise IndexError(f"index {outside[0]} is out of bounds for a dataset of {size} frames")
     rows = np.where(rows < 0, rows + size, rows)
+    pieces = columns.pieces_of(rows)
 
-    episode = columns.arrays["episode_index"][rows]
-    start, end = columns.starts[episode, None], columns.ends[episode, None]  # (B, 1)
+    index = columns.columns["index"].take(rows, pieces)[:, None]  # (B, 1)
+    episode = columns.columns["episode_index"].take(rows, pieces)[:, None]
+    start, end = columns.starts[episode], columns.ends[episode]
     deltas_of = {key: tuple(deltas) for key, deltas in (reader.delta_indices or {}).items()}
-    steps = {}  # deltas -> rows (B, K), padded (B, K); keys mostly share their deltas
+    steps = {}  # deltas -> rows (B, K), their pieces (B, K), padded (B, K); keys mostly share their deltas
     for deltas in set(deltas_of.values()):
-        wanted = index[rows, None] + np.array(deltas)  # (B, K), absolute: counted over all episodes
+        wanted = index + np.array(deltas)  # (B, K), absolute: counted over all episodes
         absolute = wanted.clip(start, end - 1)
         taken = absolute
-        if reader.episodes is not None:  # some episodes are loaded: the row is where `index` has that value
-            taken = np.searchsorted(index, absolute)
-            if (index.take(taken, mode="clip") != absolute).any():
-                raise KeyError("a window reaches a frame of its episode that is not loaded")
-        steps[deltas] = taken, wanted != absolute
+        if reader.episodes is not None:  # some episodes are loaded, each of them frame after frame
+            taken = (rows[:, None] + absolute - index).clip(0, size - 1)
+            if (columns.columns["index"].take(taken, columns.pieces_of(taken)) != absolute).any():
+                raise KeyError(
+                    "a window reaches a frame of its episode that is not loaded, or not in its place; "
+                    f"{ENVIRONMENT_VARIABLE}=0 reads frames one by one, wherever they are"
+                )
+        steps[deltas] = taken, columns.pieces_of(taken), wanted != absolute
 
     batch = {}
-    for key, array in columns.arrays.items():
-        taken = steps[deltas_of[key]][0] if key in deltas_of else rows
-        batch[key] = torch.from_numpy(array.take(taken, axis=0)).to(columns.dtypes[key])
+    for key, column in columns.columns.items():
+        where = steps[deltas_of[key]][:2] if key in deltas_of else (rows, pieces)
+        batch[key] = torch.from_numpy(column.take(*where)).to(column.dtype)
     for key, deltas in deltas_of.items():
-        batch[f"{key}_is_pad"] = torch.tensor(steps[deltas][1])  # each key its own copy, should somebody write to it
-    batch["task"] = columns.tasks[columns.arrays["task_index"][rows]].tolist()
+        batch[f"{key}_is_pad"] = torch.tensor(steps[deltas][2])  # each key its own copy, should somebody write to it
+    batch["task"] = columns.tasks[batch["task_index"].numpy()].tolist()
     return Windows(batch, len(rows))
 
 
@@ -183,9 +224,9 @@ def batched_read(dataset: LeRobotDataset) -> Callable[[Iterable[int]], Windows] 
     if hf_dataset not in _columns:
         _columns[hf_dataset] = _read_columns(hf_dataset, dataset.meta)
     columns, reader = _columns[hf_dataset], dataset.reader
-    if columns is None or (reader.episodes is not None and not columns.ascending):
+    if columns is None:
         return None
-    if reader.delta_indices is not None and not reader.delta_indices.keys() <= columns.arrays.keys() - {"task_index"}:
+    if reader.delta_indices is not None and not reader.delta_indices.keys() <= columns.columns.keys() - {"task_index"}:
         return None
     return partial(gather, columns, reader)
 
