@@ -1,11 +1,12 @@
 """Windows read in batches: LeRobotDataset's `__getitems__`, which PyTorch's DataLoader uses where a dataset has one.
 
-LeRobotDataset reads item by item, 7 to 11 ms for a window of ten steps. Here the columns of a dataset without cameras
-are held as arrays and a batch of windows is gathered by index, equal in keys, dtypes, shapes and values to the items
-read one by one and collated. `install()` adds this to LeRobotDataset; importing `lerobot_unimask` calls it.
-`UNIMASK_BATCHED_READS=0` in the environment turns it off. Oracle: `tests/test_reads.py`.
+LeRobotDataset reads item by item, 7 to 11 ms for a window of ten steps. Here a batch of windows of a dataset without
+cameras is gathered by index from the columns, which stay in the files that `datasets` has memory-mapped; it is equal in
+keys, dtypes, shapes and values to the items read one by one and collated. `install()` adds this to LeRobotDataset;
+importing `lerobot_unimask` calls it. `UNIMASK_BATCHED_READS=0` in the environment turns it off. Oracle:
+`tests/test_reads.py`.
 
-Shapes: N frames, B windows, K steps (one for each of a key's deltas), E episodes.
+Shapes: N frames, in P pieces; B windows, K steps (one for each of a key's deltas), E episodes.
 """
 
 import math
@@ -20,6 +21,8 @@ import datasets
 import numpy as np
 import pyarrow as pa
 import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import factory
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.io_utils import hf_transform_to_torch
@@ -27,6 +30,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
 ENVIRONMENT_VARIABLE = "UNIMASK_BATCHED_READS"
+_lerobots_make_dataset = factory.make_dataset
 
 
 class Item(dict):
@@ -95,7 +99,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of a dataset, memory-mapped; what is held in memory has 24 bytes for each episode and piece."""
+    """The columns of a dataset, as stored. In memory are their booleans alone, and what tells where the rest is."""
 
     columns: dict[str, Column]  # in the order of an item's keys
     pieces: np.ndarray  # (P,): the rows up to the end of each piece, the same in all columns
@@ -231,6 +235,24 @@ def batched_read(dataset: LeRobotDataset) -> Callable[[Iterable[int]], Windows] 
     return partial(gather, columns, reader)
 
 
+def make_dataset(cfg: TrainPipelineConfig) -> LeRobotDataset:
+    """LeRobot's `make_dataset`, which `lerobot-train` calls; refuses to stream windows to this policy.
+
+    Note: LeRobot 0.6.1's streams fail on windows of a feature of shape (1,), give nothing at all, and wait for ever,
+    with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`.
+
+    Raises:
+        ValueError: a unimask policy and `--dataset.streaming=true`.
+    """
+    if cfg.dataset.streaming and cfg.trainable_config.type == "unimask":
+        raise ValueError(
+            "unimask does not train on streamed datasets: LeRobot's streams do not give it whole windows. Leave out "
+            "--dataset.streaming: the columns are memory-mapped, and ten million frames need no more than 2 GB. A "
+            "dataset in a bucket has to be downloaded first, and named with --dataset.root."
+        )
+    return _lerobots_make_dataset(cfg)
+
+
 class _InstallWhereUnpickled:
     """Travels in a pickled dataset: spawned DataLoader workers import no plugin, but unpickle the dataset."""
 
@@ -239,12 +261,14 @@ class _InstallWhereUnpickled:
 
 
 def install() -> None:
-    """Give LeRobotDataset a `__getitems__`, here and in processes that its datasets are pickled to.
+    """Give LeRobotDataset a `__getitems__`, here and in processes that its datasets are pickled to, and have
+    lerobot-train refuse streams.
 
     Does nothing the second time, or where LeRobot has a `__getitems__` of its own.
     """
     if hasattr(LeRobotDataset, "__getitems__"):
         return
+    factory.make_dataset = make_dataset
     state_of = LeRobotDataset.__getstate__
     LeRobotDataset.__getitems__ = property(batched_read)
     LeRobotDataset.__getstate__ = lambda self: {**state_of(self), "_batched_read": _InstallWhereUnpickled()}
