@@ -6,7 +6,7 @@ Legend of shapes: B windows, K steps, D the dimensions of a factor.
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 from torch.nn import functional
 
 from lerobot_unimask.window import LOG_SCALE, Component, Factor, Window
@@ -34,10 +34,25 @@ def component_loss(prediction: Tensor, value: Tensor, component: Component) -> T
     return (prediction - target).square().mean(-1)
 
 
+def token_count(asked: Tensor) -> Tensor:
+    """The asked-for tokens of a batch, at least 1; of several processes' batches, on average over the processes.
+
+    Several processes train with the average of their gradients and log the average of their losses. Divided by this
+    count, a process's sum over tokens averages to the mean over all their tokens, as one process would have it that had
+    all their windows in one batch. A collective call: every process of the group computes its loss, or none.
+    """
+    count = asked.sum()
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return count.clamp_min(1)
+    distributed.all_reduce(count)
+    return count.clamp_min(1) / distributed.get_world_size()
+
+
 def masked_losses(
     predictions: dict[str, list[Tensor]], window: Window, predict: dict[str, Tensor], factors: dict[str, Factor]
 ) -> dict[str, Tensor]:
-    """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up.
+    """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up. With several
+    processes it is this process's part in the mean over all their tokens, see `token_count`.
 
     Args:
         predictions: factor -> one (B, K, size) per component, as a network puts them out.
@@ -52,7 +67,7 @@ def masked_losses(
         asked = predict[name]
         # Replaced where not asked: past the end of an episode anything may stand, even no number at all.
         value = torch.where(asked.unsqueeze(-1), window.values[name], 0.0)
-        count = asked.sum().clamp_min(1)
+        count = token_count(asked)
         losses[name] = sum(
             (component_loss(output, value, component) * asked).sum() / count
             for output, component in zip(outputs, factors[name].components, strict=True)

@@ -145,6 +145,14 @@ def test_bad_settings_end_before_anything_is_written(
     assert not run.exists()
 
 
+def test_streams_are_refused_with_what_to_use_instead(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = [*TRAIN, *dataset(root), "--steps=2", f"--output_dir={tmp_path / 'run'}", "--dataset.streaming=true"]
+    with pytest.raises(ValueError, match="Leave out --dataset\\.streaming"):
+        in_process("lerobot-train", *flags, monkeypatch=monkeypatch)
+
+
 def test_global_generators_do_not_matter_to_validation(trained: tuple[Path, str], root: Path) -> None:
     """The validation loss of a checkpoint is one number, however often and in whatever order it is computed."""
     from lerobot_unimask.experiments.validation import first_windows, task_losses

@@ -2,15 +2,20 @@
 
 import copy
 import dataclasses
+import math
 import os
 import pickle
+import shutil
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # read when huggingface_hub is imported
 
+import datasets
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -298,15 +303,49 @@ def test_lerobots_own_getitems_stays(monkeypatch):
     assert vars(own) == {"__getitems__": "LeRobot's own"}
 
 
-def test_a_column_in_one_piece_is_not_copied_and_nulls_are_refused():
+@pytest.fixture
+def in_pieces(root, tmp_path, monkeypatch):
+    """The dataset in two parquet files, which `datasets` caches in pieces of 7 rows, in several files of its own."""
+    folder = tmp_path / "pieces"
+    shutil.copytree(root, folder)
+    file = folder / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    first = sum(LENGTHS[:4])
+    pq.write_table(table[:first], file)
+    pq.write_table(table[first:], file.with_name("file-001.parquet"))
+    monkeypatch.setattr(datasets.config, "DEFAULT_MAX_BATCH_SIZE", 7)
+    monkeypatch.setattr(datasets.config, "MAX_SHARD_SIZE", 1)  # byte
+    return folder
+
+
+@pytest.mark.parametrize("episodes", [None, EPISODES])
+def test_pieces_in_several_files_are_read_where_they_are(in_pieces, episodes):
+    dataset = load(in_pieces, episodes=episodes)
+    everything = range(len(dataset))
+    assert_same(default_collate(dataset.__getitems__(everything)), one_by_one(dataset, everything))
+    columns = reads._columns[dataset.hf_dataset]
+    assert len(dataset.hf_dataset.cache_files) > 1
+    assert len(columns.pieces) > len(dataset) // 7
+    files = [Path(file["filename"]).name for file in dataset.hf_dataset.cache_files]
+    mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if line.endswith(tuple(files))]
+    ranges = [[int(bound, 16) for bound in line[0].split("-")] for line in mapped]
+    for key, column in columns.columns.items():
+        if column.numbers.dtype == bool:  # unpacked
+            continue
+        base, size = column.numbers.__array_interface__["data"][0], column.numbers.itemsize
+        for row, piece in zip(everything, columns.pieces_of(np.array(everything)), strict=True):
+            address = base + size * (column.offsets[piece] + row * math.prod(column.shape))
+            assert any(low <= address < high for low, high in ranges), key
+
+
+def test_numbers_are_not_copied_and_nulls_are_refused():
     values = np.arange(12, dtype=np.float32)
     pairs = pa.FixedSizeListArray.from_arrays(pa.array(values), 2)
-    column = pa.chunked_array([pairs])
-    assert np.shares_memory(reads._flat_numbers(column), values)
-    assert np.array_equal(reads._flat_numbers(pa.chunked_array([pairs[:2], pairs[4:]])), [0, 1, 2, 3, 8, 9, 10, 11])
-    assert reads._flat_numbers(pa.chunked_array([pa.array([1, None])])) is None
-    assert reads._flat_numbers(pa.chunked_array([pa.array([[1, 2], None])])) is None
-    assert reads._flat_numbers(pa.chunked_array([pa.array([[1, 2], [3, None]])])) is None
+    assert np.shares_memory(reads._flat_numbers(pairs), values)
+    assert np.array_equal(reads._flat_numbers(pairs[4:]), [8, 9, 10, 11])
+    assert reads._flat_numbers(pa.array([1, None])) is None
+    assert reads._flat_numbers(pa.array([[1, 2], None])) is None
+    assert reads._flat_numbers(pa.array([[1, 2], [3, None]])) is None
 
 
 def test_fifty_times_as_many_windows_a_second(root):

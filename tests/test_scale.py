@@ -1,0 +1,15 @@
+"""Ten million frames: what `scale.py` measures, held to what is promised."""
+
+import pytest
+import scale
+
+
+@pytest.mark.slow
+def test_ten_million_frames_train_like_ten_thousand() -> None:
+    result = scale.record(10_000_000)
+    print(result)
+    large = result["large"]
+    assert large["frames"] == 10_000_000
+    assert large["megabytes_beyond_imports"] < 2000
+    assert large["seconds"]["first_batch"] < 10
+    assert result["rate_of_large_over_small"] > 0.8
