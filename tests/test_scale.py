@@ -12,4 +12,4 @@ def test_ten_million_frames_train_like_ten_thousand() -> None:
     assert large["frames"] == 10_000_000
     assert large["megabytes_beyond_imports"] < 2000
     assert large["seconds"]["first_batch"] < 10
-    assert result["rate_of_large_over_small"] > 0.8
+    assert result["large_over_small"]["windows_trained_per_second"] > 0.8
