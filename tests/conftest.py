@@ -80,14 +80,14 @@ def continuous_batch():
 def tiny_policy(doorkey):
     """tiny_policy(**settings) -> an untrained DoorKey policy in evaluation mode; same settings, same weights.
 
-    `kind="continuous"` makes one of `CONTINUOUS_FEATURES`, `kind="gaussian"` the same with a Gaussian head; `features`
-    and `stats` replace those of the dataset.
+    `kind="continuous"` makes one of `CONTINUOUS_FEATURES` with an L2 head, `kind="gaussian"` with a Gaussian one;
+    `features` and `stats` replace those of the dataset.
     """
     from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 
     def make(kind="doorkey", *, features=None, stats=None, **settings):
-        if kind == "gaussian":
-            settings = {"continuous_head": "gaussian"} | settings
+        if kind == "continuous":
+            settings = {"continuous_head": "l2"} | settings
         if kind != "doorkey":
             features, stats = features or CONTINUOUS_FEATURES, stats or CONTINUOUS_STATS
         small = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "dropout": 0.0}
