@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import TASKS
-from lerobot_unimask.experiments.heatmap import markdown
+from lerobot_unimask.experiments import heatmap, table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -40,16 +40,26 @@ def test_500_episodes_are_no_more_than_2_percent_above_the_papers_random_mask_ro
 
 
 def test_the_heatmaps_diagonal_and_its_general_models_are_as_good_as_the_papers():
-    heatmap = record("heatmap.json")
-    assert heatmap["config"]["seeds"] == [0, 1]
-    rows = heatmap["losses"]["500"]
+    grid = record("heatmap.json")
+    assert grid["config"]["seeds"] == [0, 1]
+    rows = grid["losses"]["500"]
     for row in (*TASKS, "random_mask", "finetune"):
         published = paper(row)
         for task in TASKS if row in ("random_mask", "finetune") else (row,):
             assert rows[row][task]["seeds"] == 2
             assert rows[row][task]["mean"] <= 1.05 * published[task], (row, task)
-    for line in markdown(heatmap).splitlines():
+    for line in heatmap.markdown(grid).splitlines():
         assert not re.match(r"\| `.*\(", line) or line in PAGES
+
+
+def test_reading_half_of_the_windows_causally_acts_better_at_equal_updates():
+    short = record("maze_table.json")
+    rows = short["returns"]
+    for column, cell in rows["acts_and_asks"].items():
+        random = rows["unimask_random_mask"][column]
+        assert cell["mean"] - random["mean"] > 2 * (cell["standard_error"] + random["standard_error"])
+    for line in table.markdown(short).splitlines():
+        assert not line.startswith("| `") or line in PAGES
 
 
 @pytest.mark.parametrize(("rule", "success", "mean_return"), [("most_likely", 80, 6.5), ("sampled", 0, 0)])
