@@ -207,7 +207,7 @@ class Block(nn.Module):
         dropout = self.dropout if self.training else 0.0
         with torch.autocast("cpu", enabled=False):
             attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=attend, dropout_p=dropout)
-        attended = self.project(attended.transpose(1, 2).reshape(B, -1, W))
+        attended = self.project(attended.transpose(1, 2).flatten(2))
         x = x + functional.dropout(attended, self.dropout, self.training)
         return x + self.feedforward(self.norm_feedforward(x)), (key, value)
 
