@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import TASKS
-from lerobot_unimask.experiments import heatmap, table
+from lerobot_unimask.experiments import ablation, heatmap, table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -123,6 +123,15 @@ def test_doorkeys_model_that_acts_beside_random_masks_alone():
     for task in TASKS:
         cells = [losses["mean"][task] for losses in (acts, random, stacked)] + [acts["optimum"]["losses"][task]]
         assert f"| `{task}` | {' | '.join(f'{cell:.3f}' for cell in cells)} |" in PAGES
+
+
+def test_a_longer_context_costs_no_return():
+    found = record("context.json")
+    for question in ("behavior_cloning", "reward_conditioned"):
+        longer, shorter = (found["summary"][f"both, K = {K}"][question] for K in (20, 10))
+        assert longer["mean"] >= shorter["mean"] - longer["standard_error"]
+    for line in ablation.markdown(found).splitlines():
+        assert not line.startswith("| both") or line in PAGES
 
 
 def test_encoded_inputs_are_worth_it():
