@@ -134,6 +134,18 @@ def test_a_longer_context_costs_no_return():
         assert not line.startswith("| both") or line in PAGES
 
 
+def test_ten_million_frames_cost_what_the_readme_says():
+    found = record("scale.json")
+    assert found["large"]["megabytes_beyond_imports"] < 2000
+    assert found["large"]["seconds"]["first_batch"] < 10
+    assert found["large_over_small"]["windows_read_per_second"] > 0.8
+    for size in (found["small"], found["large"]):
+        cells = f"{size['seconds']['first_batch']:.2f} s | {size['megabytes_beyond_imports']:,} MB"
+        assert f"| {size['frames']:,} | {cells} | {size['windows_read_per_second']:,} |" in PAGES
+    own = found["large"]["megabytes"]["opened"]["now"] - found["large"]["megabytes"]["imports"]["now"]
+    assert f"takes {own} MB" in PAGES
+
+
 def test_encoded_inputs_are_worth_it():
     summary = record("encoding.json")["summary"]
     encoded, plain = summary["encoded numbers, K = 5"], summary["plain numbers, K = 5"]
