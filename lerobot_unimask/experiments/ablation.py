@@ -16,7 +16,7 @@ from lerobot_unimask import plots
 from lerobot_unimask.experiments.measures import latency, measure
 from lerobot_unimask.experiments.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
 from lerobot_unimask.experiments.table import QUESTIONS, maze_returns, mean_return
-from lerobot_unimask.experiments.training import Trainer, save
+from lerobot_unimask.experiments.training import Trainer
 
 
 @dataclass
@@ -97,7 +97,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
     seconds = time.process_time() - began
     policy = trainer.policy.eval()
     saved = Path(config.output) / "checkpoints" / key(run)
-    save(policy, saved)
+    policy.save_pretrained(saved)
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),
         "returns": {question: maze_returns(saved, question, config.rollouts) for question in QUESTIONS.values()},

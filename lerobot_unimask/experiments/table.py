@@ -28,7 +28,7 @@ from lerobot_unimask.experiments.study import (
     run_study,
     write_results,
 )
-from lerobot_unimask.experiments.training import Trainer, save
+from lerobot_unimask.experiments.training import Trainer
 from lerobot_unimask.returns import read_starts
 from lerobot_unimask.window import RETURN_TO_GO, STATE
 
@@ -140,7 +140,7 @@ def execute(config: TableConfig, run: Run) -> dict[str, Any]:
     )
     losses = list(trainer)
     saved = checkpoints / key(run)
-    save(trainer.policy, saved)
+    trainer.policy.save_pretrained(saved)
     questions = QUESTIONS.values() if run["task"] == BOTH else [run["task"]]
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),

@@ -16,7 +16,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
-from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.policies.factory import make_policy
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -147,10 +147,3 @@ def train_to_lowest(
                 best = {name: value.clone() for name, value in policy.state_dict().items()}
     policy.load_state_dict(best)
     return curve
-
-
-def save(policy: UniMASKPolicy, folder: Path) -> None:
-    """Weights, config and LeRobot's processors, as its evaluation loads them."""
-    policy.save_pretrained(folder)
-    for processor in make_pre_post_processors(policy.config):
-        processor.save_pretrained(folder)
