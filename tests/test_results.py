@@ -116,11 +116,10 @@ def test_the_model_that_acts_sees_five_steps_ahead_as_well_as_random_masks_alone
 
 def test_doorkeys_model_that_acts_beside_random_masks_alone():
     acts, random, stacked = (record(f"doorkey_20000{name}.json") for name in ("_both", "_random", ""))
-    for task in ("behavior_cloning", "reward_conditioned", "forward_dynamics"):
-        assert acts["mean"][task] < min(random["mean"][task], stacked["mean"][task])
-    for task in ("goal_conditioned", "past", "future"):
-        assert acts["mean"][task] <= 1.01 * random["mean"][task]
+    for task in ("behavior_cloning", "reward_conditioned"):
+        assert acts["mean"][task] < random["mean"][task]
     for task in TASKS:
+        assert acts["mean"][task] <= 1.01 * random["mean"][task]
         cells = [losses["mean"][task] for losses in (acts, random, stacked)] + [acts["optimum"]["losses"][task]]
         assert f"| `{task}` | {' | '.join(f'{cell:.3f}' for cell in cells)} |" in PAGES
 
