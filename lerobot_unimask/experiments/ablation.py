@@ -101,14 +101,10 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),
         "returns": {question: maze_returns(saved, question, config.rollouts) for question in QUESTIONS.values()},
-        "steps": config.steps,
-        "batch_size": config.batch_size,
-        "settings": settings,
+        **trainer.record(),
         "zero_hidden": run["row"] == config.zero_hidden,
-        "parameters": sum(parameter.numel() for parameter in policy.network.parameters()),
         "processor_seconds_per_update": seconds / config.steps,
         "latency": latency(policy),
-        "device": str(policy.device),
         **measure(policy, root, range(config.training_episodes, config.episodes), ahead=config.ahead),
     }
 

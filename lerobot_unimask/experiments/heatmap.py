@@ -148,21 +148,15 @@ def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
     )
     policy = trainer.policy
     batch = first_windows(policy, _validation_root(config), "local/validation")
-    curve = train_to_lowest(trainer, batch, every=config.evaluate_every, count_start=tuned)
+    lowest = train_to_lowest(trainer, batch, every=config.evaluate_every, count_start=tuned)
     if run["row"] == RANDOM_MASK:
         policy.save_pretrained(_checkpoint(config, run))
     tasks = [run["task"]] if tuned else [task for task in answered(policy, batch) if task in TASKS]
     return {
-        "loss": min(curve.values()),
-        "updates": min(curve, key=curve.get),
+        **lowest,
         "losses": task_losses(policy, batch, tasks),
-        "curve": curve,
-        "steps": trainer.steps,
-        "batch_size": config.batch_size,
         "expert": config.expert,
-        "settings": settings,
-        "parameters": sum(parameter.numel() for parameter in policy.network.parameters()),
-        "device": str(policy.device),
+        **trainer.record(),
     }
 
 

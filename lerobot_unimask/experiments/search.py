@@ -129,17 +129,7 @@ def execute(config: SearchConfig, run: Run) -> dict[str, Any]:
     trainer = Trainer(settings, root, seed=run["seed"], steps=config.steps, batch_size=batch_size)
     unseen = _root(config, config.validation_episodes, 1)
     batch = unseen_windows(trainer.policy, unseen, range(config.validation_episodes))
-    curve = train_to_lowest(trainer, batch, every=config.evaluate_every)
-    return {
-        "loss": min(curve.values()),
-        "updates": min(curve, key=curve.get),
-        "curve": curve,
-        "steps": config.steps,
-        "batch_size": batch_size,
-        "settings": settings,
-        "parameters": sum(parameter.numel() for parameter in trainer.policy.network.parameters()),
-        "device": str(trainer.policy.device),
-    }
+    return {**train_to_lowest(trainer, batch, every=config.evaluate_every), **trainer.record()}
 
 
 def nested(drawn: Mapping[str, Any]) -> dict[str, Any]:

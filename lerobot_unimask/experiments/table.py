@@ -145,11 +145,7 @@ def execute(config: TableConfig, run: Run) -> dict[str, Any]:
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),
         "returns": {question: maze_returns(saved, question, config.rollouts) for question in questions},
-        "steps": trainer.steps,
-        "batch_size": config.batch_size,
-        "settings": settings,
-        "parameters": sum(parameter.numel() for parameter in trainer.policy.network.parameters()),
-        "device": str(trainer.policy.device),
+        **trainer.record(),
     }
 
 

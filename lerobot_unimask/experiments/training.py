@@ -80,7 +80,9 @@ class Trainer:
             repo_id, root=root, delta_timestamps=resolve_delta_timestamps(config, meta), episodes=episodes
         )
         self.policy: UniMASKPolicy = make_policy(config, ds_meta=dataset.meta)
+        self.settings = settings
         self.steps = steps
+        self.batch_size = batch_size
         preset = config.get_optimizer_preset()
         self.grad_clip_norm = preset.grad_clip_norm
         self.optimizer = preset.build(self.policy.get_optim_params())
@@ -105,6 +107,16 @@ class Trainer:
                 if done == self.steps:
                     return
 
+    def record(self) -> dict[str, Any]:
+        """What a run's record says of its training."""
+        return {
+            "steps": self.steps,
+            "batch_size": self.batch_size,
+            "settings": self.settings,
+            "parameters": sum(parameter.numel() for parameter in self.policy.network.parameters()),
+            "device": str(self.policy.device),
+        }
+
     def _update(self, batch: dict[str, Any]) -> float:
         self.policy.train()
         with torch.autocast(self.policy.device.type, enabled=self.policy.config.use_amp):
@@ -120,7 +132,7 @@ class Trainer:
 
 def train_to_lowest(
     trainer: Trainer, batch: dict[str, Tensor], *, every: int, count_start: bool = False
-) -> dict[int, float]:
+) -> dict[str, Any]:
     """Train, and end with the weights that had the lowest validation loss (the paper's early stopping).
 
     Args:
@@ -129,7 +141,8 @@ def train_to_lowest(
         count_start: the weights from before the first update count too.
 
     Returns:
-        updates -> validation loss on what the policy is trained on, states and actions with weight 1.
+        What a run's record says of it: `curve`, updates -> validation loss on what the policy is trained on, states
+        and actions with weight 1; `loss`, the lowest of it; `updates`, where that was.
     """
     policy = trainer.policy
     weights = policy.training_masks.weights
@@ -146,4 +159,4 @@ def train_to_lowest(
             if curve[done] == min(curve.values()):
                 best = {name: value.clone() for name, value in policy.state_dict().items()}
     policy.load_state_dict(best)
-    return curve
+    return {"loss": min(curve.values()), "updates": min(curve, key=curve.get), "curve": curve}
