@@ -142,6 +142,26 @@ def test_a_longer_context_costs_no_return():
         assert not line.startswith("| both") or line in PAGES
 
 
+def test_the_defaults_are_what_won_the_ablation():
+    found = record("ablation.json")
+    assert found["config"]["seeds"] == [0, 1]
+    assert len(found["runs"]) == 2 * len(found["config"]["variants"])
+    error, ahead = (
+        {row.removesuffix(", K = 5"): cells[name]["mean"] for row, cells in found["summary"].items() if name in cells}
+        for name in ("behavior_cloning_error", "error_ahead")
+    )
+    losers = ("bidirectional", "bidirectional and stacked", "drawn per update", "a quarter causal", "plain numbers")
+    for loser in losers:
+        assert error["default"] < 0.95 * error[loser]
+    for loser in ("three quarters causal", "L2 head", "plain numbers"):
+        assert ahead["default"] < 0.9 * ahead[loser]
+    assert abs(error["default"] / error["zeros for hidden tokens"] - 1) < 0.01
+    for row in ("half as wide", "half as deep"):
+        assert 1.02 < error[row] / error["default"] < 1.05
+    for line in ablation.markdown(found).splitlines():
+        assert "K = 5" not in line or line in PAGES
+
+
 def test_ten_million_frames_cost_what_the_readme_says():
     found = record("scale.json")
     assert found["large"]["megabytes_beyond_imports"] < 2000
