@@ -129,6 +129,7 @@ steps: 2
 rollouts: 2
 episodes: {EPISODES}
 training_episodes: 2
+measured_episodes: 1
 ahead: 2
 policy: {{device: cpu, width: 16, depth: 1, heads: 2, feedforward_width: 16, dropout: 0.0}}
 data: {root}
@@ -141,6 +142,7 @@ output: {tmp_path / "out"}
     ]  # fmt: skip
     for run in record["runs"]:
         assert run["steps"] == 2
+        assert run["episodes"] == 1 < EPISODES - 2
         assert set(run["returns"]) == {"behavior_cloning", "reward_conditioned"}
         cell = record["summary"][f"{run['row']}, K = {run['context_length']}"]
         assert cell["error_ahead"]["mean"] == pytest.approx(run["ahead"]["model"])

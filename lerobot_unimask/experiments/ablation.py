@@ -30,6 +30,8 @@ class AblationConfig(VariantsConfig):
     steps: int = 2000
     episodes: int = 1000
     training_episodes: int = 900
+    measured_episodes: int | None = None
+    # How many of those that are not trained on are measured, the first ones; None: all.
     rollouts: int = 200
     ahead: int = 5
     # Steps that the model is asked to see ahead.
@@ -98,6 +100,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
     policy = trainer.policy.eval()
     saved = Path(config.output) / "checkpoints" / key(run)
     policy.save_pretrained(saved)
+    unseen = range(config.training_episodes, config.episodes)
     return {
         "loss": sum(losses[-100:]) / len(losses[-100:]),
         "returns": {question: maze_returns(saved, question, config.rollouts) for question in QUESTIONS.values()},
@@ -105,7 +108,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         "zero_hidden": run["row"] == config.zero_hidden,
         "processor_seconds_per_update": seconds / config.steps,
         "latency": latency(policy),
-        **measure(policy, root, range(config.training_episodes, config.episodes), ahead=config.ahead),
+        **measure(policy, root, unseen[: config.measured_episodes], ahead=config.ahead),
     }
 
 
