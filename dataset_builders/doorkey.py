@@ -1,27 +1,17 @@
 """DoorKey datasets: the noisy-rational expert of the paper, rolled out over the rules' tables."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE, REWARD
 from tqdm import tqdm
 
 from dataset_builders.writer import refuse_existing, write_dataset
-from lerobot_unimask.envs.doorkey import (
-    ACTIONS,
-    CELLS,
-    ENV_ID,
-    FPS,
-    HORIZON,
-    START_PAIRS,
-    TASK,
-    Expert,
-    expert_probabilities,
-    reward,
-    step,
-)
-from lerobot_unimask.returns import return_to_go
+from lerobot_unimask.data.returns import return_to_go
+from lerobot_unimask.envs.doorkey.episodes import Episodes, rollout
+from lerobot_unimask.envs.doorkey.expert import Expert
+from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, ENV_ID, FPS, HORIZON, TASK
 
 CHUNK = 10_000  # episodes rolled out at a time
 
@@ -37,44 +27,6 @@ FEATURES = {
     REWARD: {"dtype": "float32", "shape": (1,), "names": None},
     DONE: {"dtype": "bool", "shape": (1,), "names": None},
 }
-
-
-class Episodes(NamedTuple):
-    """E episodes of T = 10 steps; the states include the one after the last action."""
-
-    agent: np.ndarray  # (E, T + 1) int64, the agent's cell
-    key: np.ndarray  # (E, T + 1) int64, the key's cell
-    door_open: np.ndarray  # (E, T + 1) bool
-    action: np.ndarray  # (E, T) int64
-    reward: np.ndarray  # (E, T) int64
-
-
-def rollout(episodes: int, rng: np.random.Generator, *, expert: Expert = "paper", beta: float = 1.0) -> Episodes:
-    """Roll out the expert, all episodes at once.
-
-    Each episode takes the same number of draws from `rng`, one after another: so a first call for n episodes and a
-    second for m give the episodes of one call for n + m.
-
-    Raises:
-        ValueError: If `episodes` is below 1, `expert` unknown or `beta` not finite.
-    """
-    if episodes < 1:
-        raise ValueError(f"At least one episode is needed, got {episodes}.")
-    table = expert_probabilities(
-        CELLS[:, None, None], CELLS[:, None], np.array([False, True]), expert=expert, beta=beta
-    )
-    thresholds = table.cumsum(axis=-1)[..., :-1]  # (agent, key, door, 3)
-    draws = rng.random((episodes, 1 + HORIZON))
-    agent, key = START_PAIRS[(draws[:, 0] * len(START_PAIRS)).astype(np.int64)].T  # (E,)
-    door_open = np.zeros(episodes, dtype=bool)
-    states, actions = [(agent, key, door_open)], []
-    for draw in draws[:, 1:].T:
-        action = (draw[:, None] >= thresholds[agent, key, door_open.astype(np.int64)]).sum(axis=1)
-        agent, key, door_open = step(agent, key, door_open, action)
-        states.append((agent, key, door_open))
-        actions.append(action)
-    agents, keys, doors = (np.stack(column, axis=1) for column in zip(*states, strict=True))
-    return Episodes(agents, keys, doors, np.stack(actions, axis=1), reward(agents[:, :-1], agents[:, 1:]))
 
 
 def frames(episodes: Episodes) -> dict[str, np.ndarray]:

@@ -32,8 +32,8 @@ from dataset_builders.writer import (
     provenance_of_now,
     refuse_existing,
 )
-from lerobot_unimask.hub import commit_of
-from lerobot_unimask.returns import return_to_go
+from lerobot_unimask.data.returns import return_to_go
+from lerobot_unimask.sharing.hub import commit_of
 
 Episode = dict[str, np.ndarray]  # a dataset's columns of numbers: (T,) where D = 1, else (T, D)
 # One episode -> its label: a number or (D,) for all of it, or (T, D) with one row for each frame

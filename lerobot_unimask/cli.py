@@ -11,6 +11,8 @@ import shlex
 import sys
 from pathlib import Path
 
+from lerobot_unimask.plots.curves import cost_of_growth, learning_curves
+
 
 class _Parser(argparse.ArgumentParser):
     """argparse that says which flag was probably meant."""
@@ -350,13 +352,13 @@ def _check_push(arguments: argparse.Namespace) -> None:
 def _report_built(arguments: argparse.Namespace, root: Path) -> None:
     print(f"{arguments.episodes} episodes in {root}")
     if arguments.push_to_hub:
-        from lerobot_unimask.hub import push_dataset
+        from lerobot_unimask.sharing.hub import push_dataset
 
         print(f"pushed to {push_dataset(root, arguments.repo_id, private=arguments.private)}")
 
 
 def _push(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask import hub
+    from lerobot_unimask.sharing import hub
 
     if arguments.dataset:
         if arguments.results:
@@ -364,7 +366,7 @@ def _push(arguments: argparse.Namespace) -> None:
         url = hub.push_dataset(arguments.dataset, arguments.repo_id, private=arguments.private)
     else:
         from lerobot_unimask import UniMASKPolicy
-        from lerobot_unimask.experiments.validation import checkpoints_of
+        from lerobot_unimask.data.checkpoints import checkpoints_of
 
         folder = checkpoints_of(arguments.policy)[-1]
         results = [json.loads(path.read_text()) for path in arguments.results]
@@ -374,7 +376,7 @@ def _push(arguments: argparse.Namespace) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments.demo import run_demo
+    from lerobot_unimask.demo import run_demo
 
     run_demo(arguments.output, **({"steps": arguments.steps} if arguments.steps else {}))
 
@@ -400,7 +402,8 @@ def _label(arguments: argparse.Namespace) -> None:
 def _query(arguments: argparse.Namespace) -> None:
     _check_query(arguments)
     from lerobot_unimask import query
-    from lerobot_unimask.experiments.validation import check_expert
+    from lerobot_unimask.data.episodes import open_dataset, read_window
+    from lerobot_unimask.envs.doorkey.optimum import check_expert
 
     loaded = query.load_policy(arguments.path, arguments.revision)
     if arguments.mask is None:
@@ -411,9 +414,8 @@ def _query(arguments: argparse.Namespace) -> None:
     drawing = {}
     start = arguments.start or 0
     if arguments.episode is not None:
-        repo_id = arguments.repo_id or "local/dataset"
-        dataset = query.open_dataset(loaded.policy, arguments.root, repo_id)
-        batch = query.read_window(dataset, arguments.episode, start)
+        dataset = open_dataset(loaded.policy.config, arguments.root, arguments.repo_id)
+        batch = read_window(dataset, arguments.episode, start)
         drawing = {"maze": query.maze_of(dataset)}
         check_expert(Path(dataset.root), arguments.exact)
         root = str(arguments.root) if arguments.root else None
@@ -456,20 +458,22 @@ def _check_query(arguments: argparse.Namespace) -> None:
 
 def _print_given(arguments: argparse.Namespace) -> None:
     from lerobot_unimask import query
+    from lerobot_unimask.data.episodes import open_dataset
 
     policy = query.load_policy(arguments.path, arguments.revision).policy
-    dataset = query.open_dataset(policy, arguments.root, "local/dataset")
+    dataset = open_dataset(policy.config, arguments.root)
     print(json.dumps(query.given_from_episodes(policy, dataset, arguments.episodes, arguments.tokens)))
 
 
 def _questions(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments.questions import ask_everything, summary
-    from lerobot_unimask.experiments.validation import first_windows, provenance_of, training_settings
+    from lerobot_unimask.data.checkpoints import training_settings
+    from lerobot_unimask.data.episodes import first_windows, open_dataset, provenance_of
+    from lerobot_unimask.paper.questions import ask_everything, summary
     from lerobot_unimask.query import load_policy
 
     loaded = load_policy(arguments.path, arguments.revision)
-    batch = first_windows(loaded.policy, arguments.root, arguments.repo_id)
-    expert = (provenance_of(arguments.root) or {}).get("expert", "paper")
+    batch = first_windows(open_dataset(loaded.policy.config, arguments.root, arguments.repo_id))
+    expert = provenance_of(arguments.root).get("expert", "paper")
     settings = {"each": arguments.each, "samples": arguments.samples, "seed": arguments.seed, "expert": expert}
     record = ask_everything(loaded.policy, batch, **settings)
     record["policy"] = {"path": loaded.path, "revision": loaded.revision}
@@ -486,22 +490,22 @@ def _gallery(arguments: argparse.Namespace) -> None:
         raise ValueError("--maze.path and --maze.root go together: give both or neither.")
     from itertools import chain
 
-    from lerobot_unimask.experiments.gallery import doorkey_pictures, maze_pictures, write_gallery
-    from lerobot_unimask.experiments.validation import first_windows
-    from lerobot_unimask.query import load_policy, maze_of, middle_windows, open_dataset
+    from lerobot_unimask.data.episodes import first_windows, middle_windows, open_dataset
+    from lerobot_unimask.paper.gallery import doorkey_pictures, maze_pictures, write_gallery
+    from lerobot_unimask.query import load_policy, maze_of
 
     policy = load_policy(arguments.path, arguments.revision).policy
-    pictures = doorkey_pictures(policy, first_windows(policy, arguments.root, "local/dataset"))
+    pictures = doorkey_pictures(policy, first_windows(open_dataset(policy.config, arguments.root)))
     if arguments.maze_path is not None:
         maze = load_policy(arguments.maze_path).policy
-        dataset = open_dataset(maze, arguments.maze_root, "local/dataset")
+        dataset = open_dataset(maze.config, arguments.maze_root)
         pictures = chain(pictures, maze_pictures(maze, middle_windows(dataset), walls=maze_of(dataset)))
     for path in write_gallery(pictures, arguments.output, command=arguments.text):
         print(path)
 
 
 def _validate(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments.validation import validate
+    from lerobot_unimask.validation import validate
 
     record = validate(arguments.runs, arguments.root, arguments.repo_id, arguments.exact)
     record["command"] = arguments.text
@@ -518,8 +522,8 @@ def _validate(arguments: argparse.Namespace) -> None:
 
 
 def _study(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.experiments import ablation, heatmap, search, table
-    from lerobot_unimask.experiments.study import read_config
+    from lerobot_unimask.paper import ablation, heatmap, search, table
+    from lerobot_unimask.paper.study import read_config
 
     kind, run, markdown = {
         "heatmap": (heatmap.HeatmapConfig, heatmap.heatmap, heatmap.markdown),
@@ -534,12 +538,13 @@ def _study(arguments: argparse.Namespace) -> None:
 
 def _measure(arguments: argparse.Namespace) -> None:
     from lerobot_unimask import query
-    from lerobot_unimask.experiments.measures import latency, measure
-    from lerobot_unimask.experiments.study import versions
+    from lerobot_unimask.data.episodes import episode_numbers, open_dataset
+    from lerobot_unimask.measures import latency, measure
+    from lerobot_unimask.records import versions
 
     loaded = query.load_policy(arguments.path, arguments.revision)
-    dataset = query.open_dataset(loaded.policy, arguments.root, "local/dataset")
-    episodes = query.episode_numbers(arguments.episodes, len(dataset.meta.episodes))
+    dataset = open_dataset(loaded.policy.config, arguments.root)
+    episodes = episode_numbers(arguments.episodes, len(dataset.meta.episodes))
     record = measure(loaded.policy, arguments.root, episodes, ahead=arguments.ahead)
     record["latency"] = latency(loaded.policy)
     record["policy"] = {"path": loaded.path, "revision": loaded.revision, "updates": int(loaded.policy.updates)}
@@ -551,21 +556,20 @@ def _measure(arguments: argparse.Namespace) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask import plots
-    from lerobot_unimask.experiments.bench import bench, markdown
+    from lerobot_unimask.bench.measuring import bench
+    from lerobot_unimask.bench.tables import markdown
 
     record = bench(arguments.configs, quick=arguments.quick)
     record["command"] = arguments.text
     print(markdown(record))
     _write_record(record, arguments.output)
     picture = arguments.output.with_suffix(".png")
-    plots.cost_of_growth(record).savefig(picture, dpi=200)
+    cost_of_growth(record).savefig(picture, dpi=200)
     print(f"written to {arguments.output} and {picture}")
 
 
 def _curve(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask import plots
-    from lerobot_unimask.experiments.learning_curve import learning_curve
+    from lerobot_unimask.paper.learning_curve import learning_curve
 
     record = learning_curve(
         arguments.runs,
@@ -578,7 +582,7 @@ def _curve(arguments: argparse.Namespace) -> None:
     record["command"] = arguments.text
     _write_record(record, arguments.output)
     picture = arguments.output.with_suffix(".png")
-    plots.learning_curves(record).savefig(picture, dpi=200)
+    learning_curves(record).savefig(picture, dpi=200)
     print(f"written to {arguments.output} and {picture}")
 
 

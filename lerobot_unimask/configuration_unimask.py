@@ -1,7 +1,6 @@
 """The policy's one config dataclass, `--policy.type=unimask`."""
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -9,14 +8,21 @@ from typing import Any
 
 from draccus import decode
 from draccus.utils import DecodingError
-from lerobot.configs import NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_PREFIX, OBS_STATE
 
-from lerobot_unimask.masks import MAX_CONTEXT, RANDOM_MASK, parse
-from lerobot_unimask.training_masks import mixture
-from lerobot_unimask.window import RETURN_TO_GO, Feature
+from lerobot_unimask.data.factors import (
+    Feature,
+    declared_feature,
+    describe_features,
+    group_features,
+    is_numeric,
+    read_feature,
+)
+from lerobot_unimask.language.grammar import MAX_CONTEXT
+from lerobot_unimask.language.masks import RANDOM_MASK, parse
+from lerobot_unimask.language.training_masks import mixture
 
 # Each network with the ways in which it can attend, its default first
 NETWORKS = {
@@ -28,7 +34,6 @@ NETWORKS = {
 CAUSAL_DRAWS = ("window", "update")
 TOKEN_LAYOUTS = ("stacked", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
-TAKEN = (OBS_STATE, OBS_ENV_STATE, RETURN_TO_GO)  # columns that are factors already
 
 
 class FormatVersion(int):
@@ -213,12 +218,12 @@ class UniMASKConfig(PreTrainedConfig):
         Raises:
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
         """
-        found = {key: _feature(key, entry) for key, entry in dataset_features.items() if _numeric(entry)}
-        features = _group(found, self.properties)
+        found = {key: read_feature(key, entry) for key, entry in dataset_features.items() if is_numeric(entry)}
+        features = group_features(found, self.properties)
         if self.features and features != self.features:
             raise ValueError(
                 "This checkpoint was trained on other features than the dataset has.\n"
-                f"  checkpoint: {_describe(self.features)}\n  dataset:    {_describe(features)}"
+                f"  checkpoint: {describe_features(self.features)}\n  dataset:    {describe_features(features)}"
             )
         self.features = features
 
@@ -231,61 +236,6 @@ class UniMASKConfig(PreTrainedConfig):
         if not self.features:
             declared = {**(self.input_features or {}), **(self.output_features or {})}
             sizes = {key: feature for key, feature in declared.items() if len(feature.shape) <= 1}
-            self.features = _group({key: _declared(key, feature) for key, feature in sizes.items()}, self.properties)
-
-
-def _numeric(entry: dict[str, Any]) -> bool:
-    return entry["dtype"] not in ("image", "video", "string", "language") and len(entry["shape"]) <= 1
-
-
-def _feature(key: str, entry: dict[str, Any]) -> Feature:
-    size = entry["shape"][0] if entry["shape"] else 1
-    categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
-    if categories is not None and len(categories) != size:
-        raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
-    names = entry.get("names")
-    names = list(names) if isinstance(names, list | tuple) and len(names) == size else None
-    return Feature(key, size, list(categories) if categories is not None else None, names)
-
-
-def _declared(key: str, feature: PolicyFeature) -> Feature:
-    return Feature(key, feature.shape[0] if feature.shape else 1)
-
-
-def _group(found: dict[str, Feature], properties: Sequence[str]) -> dict[str, list[Feature]]:
-    """Which factor each column belongs to. `s` is what LeRobot calls the robot's and the environment's state: a label
-    of the episode under another name must never slip into it, for no environment reports one."""
-    states = [found[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in found]
-    if not states:
-        raise ValueError(f"The dataset has no {OBS_STATE!r}: UniMASK models states and actions. It has {list(found)}.")
-    if ACTION not in found:
-        raise ValueError(f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}.")
-    features = {"s": states, "a": [found[ACTION]]}
-    if RETURN_TO_GO in found:
-        features["rtg"] = [found[RETURN_TO_GO]]
-    for key in properties:
-        name = key.rpartition(".")[-1]
-        if key not in found:
-            others = [other for other in found if other.startswith(OBS_PREFIX) and other not in TAKEN]
-            raise ValueError(
-                f"properties names {key!r}, which the dataset does not have; columns that could be one: "
-                f"{', '.join(others) or 'none'}. `unimask label` adds one."
+            self.features = group_features(
+                {key: declared_feature(key, feature) for key, feature in sizes.items()}, self.properties
             )
-        if key in TAKEN or found[key] in features.get(name, []):
-            raise ValueError(f"{key!r} is a factor already, so it cannot be named in properties as well.")
-        if not key.startswith(OBS_PREFIX) or not re.fullmatch(r"[A-Za-z_]\w*", name) or name in ("t", "rtg", *features):
-            raise ValueError(
-                f"{key!r} cannot be a property: it is named observation.NAME, NAME is letters, digits and "
-                f"underscores, and s, a, t, rtg and other properties' names are taken."
-            )
-        features[name] = [found[key]]
-    return features
-
-
-def _describe(features: dict[str, list[Feature]]) -> str:
-    kinds = (
-        f"{name} = {f.key} ({f.size} numbers{f', categories {f.categories}' if f.categories else ''})"
-        for name, columns in features.items()
-        for f in columns
-    )
-    return "; ".join(kinds)

@@ -22,23 +22,26 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lerobot_unimask import hub, inference
+from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.answers import answer as answer_question
+from lerobot_unimask.asking.given import Given, check_known, check_shown, check_values, give, read_given
+from lerobot_unimask.asking.memory import RolloutMemory
+from lerobot_unimask.asking.sampling import Check, Samples
+from lerobot_unimask.asking.sampling import sample as sample_tokens
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.inference import Answer, Check, Given, RolloutMemory, Samples
-from lerobot_unimask.losses import masked_losses
-from lerobot_unimask.masks import Mask, MaskError, MaskTable, tabulate
+from lerobot_unimask.data.factors import RETURN_SO_FAR, RETURN_TO_GO, make_factors
+from lerobot_unimask.data.returns import EpisodeStarts, read_starts
+from lerobot_unimask.data.window import Statistics, Window, make_window
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import Mask, MaskTable, tabulate
+from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
 from lerobot_unimask.networks import make_network
-from lerobot_unimask.networks.transformer import Cache, Predictions
+from lerobot_unimask.networks.layers import Cache, Predictions
+from lerobot_unimask.networks.losses import masked_losses
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
-from lerobot_unimask.returns import EpisodeStarts, read_starts
-from lerobot_unimask.training_masks import TrainingMasks
-from lerobot_unimask.window import RETURN_SO_FAR, RETURN_TO_GO, Statistics, Window, make_factors, make_window
+from lerobot_unimask.sharing import hub
 
 logger = logging.getLogger(__name__)
-
-# The update count of training masks is never negative, so validation draws masks that no update has seen, and at every
-# validation the same ones.
-VALIDATION_STEP = -1
 
 
 class LossParts(Mapping[str, float]):
@@ -134,12 +137,12 @@ class UniMASKPolicy(PreTrainedPolicy):
             if not 0 <= weight < float("inf"):
                 raise ValueError(f"loss_weights gives {name} the weight {weight}; weights are numbers from 0 on.")
         table = self._acting_table(self.config.inference_mask)
-        tokens = list(inference.read_given(self.config.given, self.factors, self.config.context_length))
+        tokens = list(read_given(self.config.given, self.factors, self.config.context_length))
         if self.config.target_return is not None:
             if ("rtg", 0) in tokens:
                 raise ValueError("target_return and given both name rtg[0]; give one of them.")
             tokens.append(("rtg", 0))
-        inference.check_shown(tokens, table.shows, self.config.inference_mask)
+        check_shown(tokens, table.shows, self.config.inference_mask)
         missing = [
             f"{name}[{step}]"
             for name, ahead in table.shows_ahead.items()
@@ -257,7 +260,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """
         window, mask = self.pose(window, mask, t, given)
         with _evaluation(self):
-            return inference.answer(self.predict, self.statistics, self.factors, window, mask)
+            return answer_question(self.predict, self.statistics, self.factors, window, mask)
 
     @torch.no_grad()
     def sample(
@@ -279,7 +282,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             samples: how many of each window; those of a window stand together in the result, (B * samples, K, D).
             order: `forward` in time, `backward` or `random`.
             seed: the same seed draws the same samples.
-            check: what a sample must not contradict: what it rejects is drawn again, see `inference.sample`.
+            check: what a sample must not contradict: what it rejects is drawn again, see `asking.sampling.sample`.
             tries: bounds how often.
 
         Returns:
@@ -293,7 +296,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         window, mask = window.repeat(samples), mask.repeat(samples)
         generator = torch.Generator(self.device).manual_seed(seed)
         with _evaluation(self):
-            return inference.sample(
+            return sample_tokens(
                 self.predict,
                 self.statistics,
                 self.factors,
@@ -313,7 +316,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         K = self.config.context_length
         recorded = window is not None
         if window is None:
-            rows = (len(token) for token in inference.read_given(given or {}, self.factors, K).values())
+            rows = (len(token) for token in read_given(given or {}, self.factors, K).values())
             empty = RolloutMemory(self.factors, K, max(rows, default=1), self.device)
             window = empty.window(self.statistics.horizon)
             empty.carry_return(window)
@@ -329,18 +332,18 @@ class UniMASKPolicy(PreTrainedPolicy):
             table = self._table(mask)
             text, mask = table.question.text, table.at(None if t is None else operator.index(t), batch_size)
         mask = mask.to(self.device).within(window.valid)
-        tokens = inference.read_given(given or {}, self.factors, K, batch_size)
+        tokens = read_given(given or {}, self.factors, K, batch_size)
         known = {}
         for name, value in window.values.items():
             lacking = mask.visible[name] & value.isnan().any(-1)  # as in a sample, or a column that is not there
             known[name] = torch.full((K,), recorded) & ~lacking.any(0).cpu()
         for name, step in tokens:  # here the user changes a recorded window on purpose
             known[name][step] = False
-        window, known = inference.give(window, tokens, known)
-        inference.check_shown(tokens, mask.visible, text)
-        inference.check_known(mask, known, text)
+        window, known = give(window, tokens, known)
+        check_shown(tokens, mask.visible, text)
+        check_known(mask, known, text)
         for name, value in window.values.items():
-            inference.check_values(f"A shown token of {name}", value[mask.visible[name]], self.factors[name])
+            check_values(f"A shown token of {name}", value[mask.visible[name]], self.factors[name])
         return window, mask
 
     def _table(self, text: str) -> MaskTable:
@@ -404,21 +407,21 @@ class UniMASKPolicy(PreTrainedPolicy):
         memory.observe(state, so_far.to(self.device).reshape(-1) if so_far is not None else None)
         if memory.step == 0:
             memory.target_return = self._choose_target(state)
-        tokens = inference.read_given(
+        tokens = read_given(
             self.config.given if given is None else given, self.factors, self.config.context_length, len(state)
         )
         if given is not None:  # the config's may go unused by a question that is asked in passing
-            inference.check_shown(tokens, table.shows, text)
+            check_shown(tokens, table.shows, text)
         if "rtg" in self.factors and table.shows["rtg"][0]:
             target = tokens.get(("rtg", 0), memory.target_return)
             if target is not None:
                 tokens["rtg", 0] = memory.remaining(target.to(self.device))
-        window, known = inference.give(memory.window(self.statistics.horizon), tokens, memory.known())
+        window, known = give(memory.window(self.statistics.horizon), tokens, memory.known())
         memory.carry_return(window)
         posed = table.at(memory.position, len(state))
-        inference.check_known(posed, known, text)
+        check_known(posed, known, text)
         with _evaluation(self):
-            answer = inference.answer(
+            answer = answer_question(
                 self.predict, self.statistics, self.factors, window, posed.to(self.device), memory.cache
             )
         chosen = self.config.sample_actions if sample is None else sample
@@ -459,7 +462,7 @@ class UniMASKPolicy(PreTrainedPolicy):
                 )
             parts.append(value.to(self.device, torch.float32))
         state = torch.cat(parts, dim=-1)
-        inference.check_values("The observed state", state, self.factors["s"])
+        check_values("The observed state", state, self.factors["s"])
         return state
 
     # --- Checkpoints -------------------------------------------------------------------------------------------------

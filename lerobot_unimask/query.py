@@ -16,27 +16,30 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from matplotlib.figure import Figure
 from torch import Tensor
-from torch.utils.data import default_collate
 
-from lerobot_unimask import hub, plots
-from lerobot_unimask.envs.doorkey import DynamicsCheck, Expert
-from lerobot_unimask.experiments.optimum import check_features, exact_answer
-from lerobot_unimask.experiments.validation import checkpoints_of, provenance_of
-from lerobot_unimask.inference import Answer, Check, Given, Samples
-from lerobot_unimask.masks import ASKABLE, TASKS, Mask, MaskError, parse_token, tabulate
+from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.given import Given
+from lerobot_unimask.asking.sampling import Check, Samples
+from lerobot_unimask.data.checkpoints import checkpoints_of
+from lerobot_unimask.data.episodes import episode_numbers, provenance_of, read_window
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.envs.doorkey.expert import Expert
+from lerobot_unimask.envs.doorkey.optimum import check_features, exact_answer
+from lerobot_unimask.envs.doorkey.pictures import state_distributions, trajectories
+from lerobot_unimask.envs.doorkey.rules import DynamicsCheck
+from lerobot_unimask.envs.maze2d.pictures import maze_trajectories
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import ASKABLE, TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.window import Window
+from lerobot_unimask.plots.answers import distributions, marginals
+from lerobot_unimask.sharing import hub
 
 CHECKS = ("dynamics", "agreement")
+
 DOORKEY, MAZE2D = ["agent_cell", "key_cell"], ["x", "y", "goal_x", "goal_y"]  # by the names of their states' numbers
-
-
-# --- The policy -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -73,46 +76,9 @@ def load_policy(path: str, revision: str | None = None) -> Loaded:
     return Loaded(policy, str(folder) if local else path, hub.commit_of(folder))
 
 
-# --- The episode ------------------------------------------------------------------------------------------------------
-
-
-def open_dataset(policy: UniMASKPolicy, root: Path | None, repo_id: str) -> LeRobotDataset:
-    """A dataset whose items are windows of this policy.
-
-    Raises:
-        FileNotFoundError: there is no dataset in `root`. (LeRobot would ask the Hub for it.)
-    """
-    if root is not None and not (root / "meta" / "info.json").exists():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
-    meta = LeRobotDatasetMetadata(repo_id, root=root)
-    return LeRobotDataset(repo_id, root=root, delta_timestamps=resolve_delta_timestamps(policy.config, meta))
-
-
-def read_window(dataset: LeRobotDataset, episode: int, start: int = 0) -> dict[str, Tensor]:
-    """The window at one step of one episode, as a LeRobot batch of one.
-
-    Raises:
-        ValueError: there is no such episode or step.
-    """
-    episodes = len(dataset.meta.episodes)
-    if not 0 <= episode < episodes:
-        raise ValueError(f"There is no episode {episode}: this dataset's are 0 to {episodes - 1}.")
-    first, end = (dataset.meta.episodes[name][episode] for name in ("dataset_from_index", "dataset_to_index"))
-    if not 0 <= start < end - first:
-        raise ValueError(f"Episode {episode} has no step {start}: its steps are 0 to {end - first - 1}.")
-    return default_collate([dataset[first + start]])
-
-
 def maze_of(dataset: LeRobotDataset) -> str:
     """The maze, a name or text, that a Maze2D dataset was built in."""
-    return (provenance_of(Path(dataset.root)) or {}).get("maze", "medium")
-
-
-def middle_windows(dataset: LeRobotDataset, most: int = 200) -> dict[str, Tensor]:
-    """The windows in the middle of the first episodes, as a LeRobot batch."""
-    episodes = dataset.meta.episodes
-    bounds = zip(episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True)
-    return default_collate([dataset[(first + end) // 2] for first, end in list(bounds)[:most]])
+    return provenance_of(Path(dataset.root)).get("maze", "medium")
 
 
 def given_from_episodes(
@@ -143,21 +109,6 @@ def given_from_episodes(
         discrete = all(component.discrete for component in factor.components)
         rows[text.strip()] = (values.long() if discrete else values).tolist()
     return rows
-
-
-def episode_numbers(text: str, count: int) -> list[int]:
-    if match := re.fullmatch(r"(\d*):(\d*)", text):
-        numbers = list(range(int(match[1] or 0), int(match[2] or count)))
-    elif re.fullmatch(r"\d+(,\d+)*", text):
-        numbers = [int(number) for number in text.split(",")]
-    else:
-        numbers = []
-    if not numbers or max(numbers) >= count:
-        raise ValueError(f"episodes is {text!r}; write 0:50 or 3,5,7: this dataset's are 0 to {count - 1}.")
-    return numbers
-
-
-# --- The question -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -315,9 +266,6 @@ def _labels(policy: UniMASKPolicy) -> dict[str, list[str]]:
     return labels
 
 
-# --- Text and JSON ----------------------------------------------------------------------------------------------------
-
-
 def record(
     loaded: Loaded,
     mask: str,
@@ -472,9 +420,6 @@ def describe_overview(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# --- Pictures ---------------------------------------------------------------------------------------------------------
-
-
 def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, maze: str = "medium") -> Figure:
     """The picture that suits the environment and the answer; of any other model, its marginals or distributions.
 
@@ -485,16 +430,16 @@ def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, maze: str = "medi
     every_state = bool((reply.mask.visible["s"] | reply.mask.predict["s"]).all())
     if isinstance(reply.answer, Samples):
         if states == DOORKEY and every_state:
-            return plots.trajectories({mask: reply.answer.values["s"].long().numpy(force=True)})
+            return trajectories({mask: reply.answer.values["s"].long().numpy(force=True)})
         groups = {"sampled": _known(reply.answer, reply.mask)}
         if reply.recorded is not None:
             groups = {"recorded": _known(reply.recorded, reply.mask), **groups}
-        return plots.distributions(groups, policy.factors)
+        return distributions(groups, policy.factors)
     if states == DOORKEY and every_state:
-        return plots.state_distributions(reply.answer)
+        return state_distributions(reply.answer)
     if states == MAZE2D and reply.mask.predict["s"].any():
-        return plots.maze_trajectories(reply.answer, reply.recorded, maze=maze)
-    return plots.marginals(reply.answer, reply.recorded)
+        return maze_trajectories(reply.answer, reply.recorded, maze=maze)
+    return marginals(reply.answer, reply.recorded)
 
 
 def _known(window: Window, mask: Mask) -> Window:

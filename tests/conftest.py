@@ -38,7 +38,7 @@ def load_doorkey(doorkey_root):
     """load_doorkey(context_length=10) -> LeRobotDataset whose items are windows."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_unimask.envs.doorkey import FPS
+    from lerobot_unimask.envs.doorkey.rules import FPS
 
     def load(context_length=10):
         seconds = [step / FPS for step in range(context_length)]

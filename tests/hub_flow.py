@@ -48,7 +48,7 @@ from huggingface_hub import constants  # noqa: E402
 from lerobot.scripts import lerobot_eval, lerobot_train  # noqa: E402
 
 from lerobot_unimask import UniMASKPolicy, cli  # noqa: E402
-from lerobot_unimask.hub import HubError  # noqa: E402
+from lerobot_unimask.sharing.hub import HubError  # noqa: E402
 
 SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
 TRAIN = ["--batch_size=8", "--num_workers=0", "--policy.device=cpu"]
@@ -387,7 +387,7 @@ def test_of_two_pushes_at_once_one_is_there_and_the_other_is_told(checkpoint: Pa
         policy.updates.fill_(100 + number)
         policy.save_pretrained(HOME / f"both_{number}")
         policies.append((policy, HOME / f"both_{number}"))
-    from lerobot_unimask.hub import push_policy
+    from lerobot_unimask.sharing.hub import push_policy
 
     barrier, ended = threading.Barrier(2), [None, None]
 

@@ -7,9 +7,10 @@ import torch
 from torch.utils.data import default_collate
 
 from lerobot_unimask.configuration_unimask import NETWORKS, UniMASKConfig
-from lerobot_unimask.envs.doorkey import DoorKeyEnv
-from lerobot_unimask.masks import Mask, MaskError
-from lerobot_unimask.window import Window
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.envs.doorkey.environment import DoorKeyEnv
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import Mask
 
 K = 10
 CAUSAL = ("decision_gpt", "decision_transformer")

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from lerobot_unimask import plots
+from lerobot_unimask.bench.measuring import CONFIGS, QUICK, Stopwatch, alone, spread
+from lerobot_unimask.bench.tables import markdown, targets
 from lerobot_unimask.cli import main
-from lerobot_unimask.experiments.bench import CONFIGS, QUICK, Stopwatch, alone, markdown, spread, targets
+from lerobot_unimask.plots.curves import cost_of_growth
 
 ROOT = Path(__file__).parents[1]
 RECORD = ROOT / "docs" / "results" / "bench.json"
@@ -137,7 +138,7 @@ def test_a_folder_without_configs_is_refused(tmp_path, capsys):
 
 
 def test_the_figure_draws_every_point(record):
-    figure = plots.cost_of_growth(record)
+    figure = cost_of_growth(record)
     assert len(figure.axes) == 2 * len(record["growth"])
     for column, (what, points) in enumerate(record["growth"].items()):
         time, memory = (figure.axes[row * len(record["growth"]) + column] for row in (0, 1))

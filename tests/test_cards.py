@@ -9,7 +9,7 @@ import yaml
 from PIL import Image
 
 from dataset_builders.maze2d import build_maze2d
-from lerobot_unimask import cards
+from lerobot_unimask.sharing import cards
 
 TRAIN_CONFIG = {"dataset": {"repo_id": "me/doorkey", "root": None}, "env": {"type": "doorkey"}}
 

@@ -11,13 +11,13 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_unimask import UniMASKConfig
 from lerobot_unimask.cli import make_parser
-from lerobot_unimask.experiments.ablation import AblationConfig
-from lerobot_unimask.experiments.heatmap import HeatmapConfig
-from lerobot_unimask.experiments.search import SearchConfig, draw, nested
-from lerobot_unimask.experiments.study import read_config
-from lerobot_unimask.experiments.table import TableConfig
-from lerobot_unimask.masks import tabulate
-from lerobot_unimask.training_masks import TrainingMasks
+from lerobot_unimask.language.masks import tabulate
+from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.paper.ablation import AblationConfig
+from lerobot_unimask.paper.heatmap import HeatmapConfig
+from lerobot_unimask.paper.search import SearchConfig, draw, nested
+from lerobot_unimask.paper.study import read_config
+from lerobot_unimask.paper.table import TableConfig
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted(path.relative_to(ROOT) for path in ROOT.glob("configs/*.yaml"))

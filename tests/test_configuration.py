@@ -7,7 +7,7 @@ import pytest
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from lerobot_unimask import MaskError, UniMASKConfig
-from lerobot_unimask.window import Feature
+from lerobot_unimask.data.factors import Feature
 
 
 def make(**settings):

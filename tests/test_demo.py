@@ -12,9 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from lerobot_unimask import UniMASKPolicy
-from lerobot_unimask.experiments import demo
-from lerobot_unimask.masks import TASKS
+from lerobot_unimask import UniMASKPolicy, demo
+from lerobot_unimask.language.masks import TASKS
 
 FILES = {"demo.json", "five_panels.png", "state_distributions.png"}
 QUESTIONS = {"imitation", "imitation, sampled actions"}

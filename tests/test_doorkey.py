@@ -13,9 +13,12 @@ from lerobot.envs import env_to_policy_features, make_env, make_env_config, make
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import rollout as lerobot_rollout
 
-from dataset_builders.doorkey import FEATURES, build_doorkey, frames, rollout
+from dataset_builders.doorkey import FEATURES, build_doorkey, frames
 from dataset_builders.writer import PROVENANCE_PATH
-from lerobot_unimask.envs.doorkey import (
+from lerobot_unimask.envs.doorkey.environment import DoorKeyEnv
+from lerobot_unimask.envs.doorkey.episodes import rollout
+from lerobot_unimask.envs.doorkey.expert import expert_probabilities
+from lerobot_unimask.envs.doorkey.rules import (
     DOOR,
     ENV_ID,
     GOAL,
@@ -23,12 +26,10 @@ from lerobot_unimask.envs.doorkey import (
     START_CELLS,
     START_PAIRS,
     TASK,
-    DoorKeyEnv,
     DynamicsCheck,
     cell_at,
     coordinates,
     distance_to_goal,
-    expert_probabilities,
     reward,
     step,
 )

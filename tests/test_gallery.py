@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lerobot_unimask import cli
-from lerobot_unimask.experiments import gallery
-from lerobot_unimask.experiments.gallery import LARGEST, Picture, doorkey_pictures, maze_pictures, write_gallery
+from lerobot_unimask.paper import gallery
+from lerobot_unimask.paper.gallery import LARGEST, Picture, doorkey_pictures, maze_pictures, write_gallery
 
 MAZE = {
     "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},

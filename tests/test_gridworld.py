@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from dataset_builders.doorkey import FEATURES, rollout
+from dataset_builders.doorkey import FEATURES
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
-from lerobot_unimask.envs.doorkey import GOAL, HORIZON, START_PAIRS, reward, step
-from lerobot_unimask.experiments.gridworld import (
+from lerobot_unimask.envs.doorkey.episodes import rollout
+from lerobot_unimask.envs.doorkey.optimum import Optimum
+from lerobot_unimask.envs.doorkey.panels import (
     BACKWARDS,
     ROLLOUTS,
     SHOWN_STATES,
@@ -24,7 +25,7 @@ from lerobot_unimask.experiments.gridworld import (
     rollout_panel,
     state_at,
 )
-from lerobot_unimask.experiments.optimum import Optimum
+from lerobot_unimask.envs.doorkey.rules import GOAL, HORIZON, START_PAIRS, reward, step
 
 IMITATION, _ = ROLLOUTS["Imitation"]
 
@@ -138,7 +139,7 @@ def test_histories_drawn_backwards_are_possible_and_end_in_the_given_state(monke
 
 
 def test_a_policy_that_draws_nothing_possible_has_an_empty_panel(policy, monkeypatch):
-    monkeypatch.setattr("lerobot_unimask.experiments.gridworld.TRIES", 1)
+    monkeypatch.setattr("lerobot_unimask.envs.doorkey.panels.TRIES", 1)
     panel = backwards_panel(policy)
     assert (panel.states, panel.actions, panel.achieved) == ([], [], {"possible histories": 0})
 

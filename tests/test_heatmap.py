@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import TASKS, UniMASKPolicy, cli
-from lerobot_unimask.experiments.heatmap import (
+from lerobot_unimask.data.episodes import first_windows, open_dataset
+from lerobot_unimask.paper.heatmap import (
     FINETUNE,
     ROWS,
     HeatmapConfig,
@@ -16,8 +17,8 @@ from lerobot_unimask.experiments.heatmap import (
     optimum_losses,
     paper_losses,
 )
-from lerobot_unimask.experiments.study import read_config
-from lerobot_unimask.experiments.validation import first_windows, task_losses
+from lerobot_unimask.paper.study import read_config
+from lerobot_unimask.validation import task_losses
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SMALL = {
@@ -75,7 +76,7 @@ def test_every_row_has_the_tasks_that_it_answers(config, record):
 def test_a_cell_is_what_validate_finds_of_the_kept_weights(config, record):
     """The random-mask model of seed 1, loaded from its checkpoint."""
     policy = UniMASKPolicy.from_pretrained(Path(config.output) / "checkpoints" / "random_mask-20-1")
-    batch = first_windows(policy, Path(config.data) / "released_validation_30", "local/doorkey")
+    batch = first_windows(open_dataset(policy.config, Path(config.data) / "released_validation_30"))
     (run,) = (run for run in record["runs"] if run["row"] == "random_mask" and run["seed"] == 1)
     assert run["losses"] == pytest.approx(task_losses(policy, batch, TASKS))
     assert int(policy.updates) == run["updates"]

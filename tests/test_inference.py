@@ -5,9 +5,14 @@ from itertools import pairwise
 import pytest
 import torch
 
-from lerobot_unimask.inference import ORDERS, RolloutMemory, answer, check_known, give, read_given, sample
-from lerobot_unimask.masks import Mask, MaskError, tabulate
-from lerobot_unimask.window import Feature, Statistics, Window, make_factors
+from lerobot_unimask.asking.answers import answer
+from lerobot_unimask.asking.given import check_known, give, read_given
+from lerobot_unimask.asking.memory import RolloutMemory
+from lerobot_unimask.asking.sampling import ORDERS, sample
+from lerobot_unimask.data.factors import Feature, make_factors
+from lerobot_unimask.data.window import Statistics, Window
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import Mask, tabulate
 
 # --- A network that knows the joint distribution ---------------------------------------------------------------------
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from lerobot_unimask import plots
-from lerobot_unimask.experiments.learning_curve import learning_curve
+from lerobot_unimask.paper.learning_curve import learning_curve
+from lerobot_unimask.plots.curves import learning_curves
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 
 
@@ -39,7 +39,7 @@ def test_every_checkpoint_is_rolled_out_and_the_last_one_longest(run):
 
 def test_the_picture_has_a_line_for_each_run():
     points = [{"updates": u, "mean_return": 0.1 * u, "standard_error": 0.2} for u in (1, 2, 3)]
-    figure = plots.learning_curves({"runs": [{"run": name, "checkpoints": points} for name in ("k5", "k10")]})
+    figure = learning_curves({"runs": [{"run": name, "checkpoints": points} for name in ("k5", "k10")]})
     (axes,) = figure.axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("updates", "mean return")
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["k5", "k10"]

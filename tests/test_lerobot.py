@@ -11,6 +11,7 @@ import torch
 
 from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask.data.episodes import open_dataset
 
 SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
 TRAIN = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", *SMALL]
@@ -155,10 +156,11 @@ def test_streams_are_refused_with_what_to_use_instead(
 
 def test_global_generators_do_not_matter_to_validation(trained: tuple[Path, str], root: Path) -> None:
     """The validation loss of a checkpoint is one number, however often and in whatever order it is computed."""
-    from lerobot_unimask.experiments.validation import first_windows, task_losses
+    from lerobot_unimask.data.episodes import first_windows
+    from lerobot_unimask.validation import task_losses
 
     policy = UniMASKPolicy.from_pretrained(trained[0] / "checkpoints/last/pretrained_model")
-    batch = first_windows(policy, root, "local/doorkey")
+    batch = first_windows(open_dataset(policy.config, root))
     torch.manual_seed(1)
     once = task_losses(policy, batch, ["behavior_cloning", "random_mask"])
     torch.manual_seed(2)

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from lerobot_unimask.losses import component_loss, masked_losses
-from lerobot_unimask.window import Feature, Window, make_factors
+from lerobot_unimask.data.factors import Feature, make_factors
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.networks.losses import component_loss, masked_losses
 
 B, K = 5, 4
 FEATURES = {

@@ -6,18 +6,8 @@ import re
 import pytest
 import torch
 
-from lerobot_unimask.masks import (
-    MAX_CONTEXT,
-    MAX_TEXT,
-    RANDOM_MASK,
-    REGIMES,
-    TASKS,
-    Mask,
-    MaskError,
-    parse,
-    parse_token,
-    tabulate,
-)
+from lerobot_unimask.language.grammar import MAX_CONTEXT, MAX_TEXT, MaskError
+from lerobot_unimask.language.masks import RANDOM_MASK, REGIMES, TASKS, Mask, parse, parse_token, tabulate
 
 FACTORS = ("s", "a", "rtg")
 QUESTIONS = [

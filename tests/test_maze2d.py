@@ -16,16 +16,11 @@ from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import preprocess_observation
 
 import lerobot_unimask.envs  # noqa: F401 (registers the environment)
-from dataset_builders.maze2d import WaypointExpert, build_maze2d, collect_episodes, measure_build, shortest_path
-from lerobot_unimask.envs.maze2d import (
-    HORIZON,
-    MAZES,
-    PIXELS_PER_CELL,
-    Maze2DEnv,
-    compile_maze,
-    draw_maze,
-    parse_maze,
-)
+from dataset_builders.maze2d import build_maze2d, collect_episodes, measure_build
+from lerobot_unimask.envs.maze2d.environment import Maze2DEnv, compile_maze
+from lerobot_unimask.envs.maze2d.expert import WaypointExpert, shortest_path
+from lerobot_unimask.envs.maze2d.maze import HORIZON, MAZES, parse_maze
+from lerobot_unimask.envs.maze2d.rendering import PIXELS_PER_CELL, draw_maze
 
 MASS = 4 / 3 * math.pi * 0.1**3 * 1000
 REST = np.zeros(2, np.float32)

@@ -10,7 +10,8 @@ from torch.distributions import Categorical, Normal, kl_divergence
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.cli import main
-from lerobot_unimask.experiments.measures import (
+from lerobot_unimask.data.factors import Component
+from lerobot_unimask.measures import (
     _divergence,
     action_error,
     disagreement,
@@ -19,7 +20,6 @@ from lerobot_unimask.experiments.measures import (
     measure,
     unseen_windows,
 )
-from lerobot_unimask.window import Component
 
 EPISODES, LAST = 4, [2, 3]
 

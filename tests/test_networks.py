@@ -5,10 +5,12 @@ import math
 import pytest
 import torch
 
-from lerobot_unimask.losses import masked_losses
+from lerobot_unimask.data.factors import Feature, make_factors
+from lerobot_unimask.data.window import Window
 from lerobot_unimask.networks.feedforward import FeedForward
-from lerobot_unimask.networks.transformer import Cache, NumberEncoding, Transformer, course
-from lerobot_unimask.window import Feature, Window, make_factors
+from lerobot_unimask.networks.layers import Cache, NumberEncoding, course
+from lerobot_unimask.networks.losses import masked_losses
+from lerobot_unimask.networks.transformer import Transformer
 
 B, K = 3, 5
 LAYOUTS = ("stacked", "separate", "stacked, plain inputs")

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from dataset_builders.doorkey import Episodes, rollout
-from lerobot_unimask.envs.doorkey import DOOR, GOAL, START_PAIRS, distance_to_goal, expert_probabilities, reward, step
-from lerobot_unimask.experiments import optimum as module
-from lerobot_unimask.experiments.optimum import (
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.envs.doorkey import optimum as module
+from lerobot_unimask.envs.doorkey.episodes import Episodes, rollout
+from lerobot_unimask.envs.doorkey.expert import expert_probabilities
+from lerobot_unimask.envs.doorkey.optimum import (
     FACTORS,
     Optimum,
     divergences,
@@ -19,10 +20,10 @@ from lerobot_unimask.experiments.optimum import (
     mean_over_asked,
     random_mask_divergence,
 )
-from lerobot_unimask.losses import masked_losses
-from lerobot_unimask.masks import TASKS, Mask, tabulate
-from lerobot_unimask.training_masks import TrainingMasks
-from lerobot_unimask.window import Window
+from lerobot_unimask.envs.doorkey.rules import DOOR, GOAL, START_PAIRS, distance_to_goal, reward, step
+from lerobot_unimask.language.masks import TASKS, Mask, tabulate
+from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.networks.losses import masked_losses
 
 EXPERTS = ("paper", "released")
 # Twenty masks that show little enough for many of two million episodes to agree; four with the return.

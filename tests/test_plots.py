@@ -9,13 +9,24 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from dataset_builders.doorkey import FEATURES, rollout
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy, plots
-from lerobot_unimask.envs.doorkey import GOAL, HORIZON, coordinates
-from lerobot_unimask.envs.maze2d import MAZES
-from lerobot_unimask.experiments import gridworld
-from lerobot_unimask.masks import tabulate
-from lerobot_unimask.window import Window
+from dataset_builders.doorkey import FEATURES
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.envs.doorkey import panels as gridworld
+from lerobot_unimask.envs.doorkey.episodes import rollout
+from lerobot_unimask.envs.doorkey.pictures import (
+    _draw_trajectories,
+    draw_grid,
+    draw_panels,
+    state_distributions,
+    trajectories,
+)
+from lerobot_unimask.envs.doorkey.rules import GOAL, HORIZON, coordinates
+from lerobot_unimask.envs.maze2d.maze import MAZES
+from lerobot_unimask.envs.maze2d.pictures import maze_trajectories
+from lerobot_unimask.language.masks import tabulate
+from lerobot_unimask.plots.answers import distributions, marginals, mask_diagram
+from lerobot_unimask.plots.style import ASKED, LEAST, SHOWN, WALL, WIDTH, time_colours
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +55,8 @@ def expert_panel(**changes):
 
 def test_the_grid_shows_walls_door_and_goal():
     axes = Figure().subplots()
-    plots.draw_grid(axes)
-    walls = [patch for patch in axes.patches if patch.get_facecolor() == to_rgba(plots.WALL)]
+    draw_grid(axes)
+    walls = [patch for patch in axes.patches if patch.get_facecolor() == to_rgba(WALL)]
     assert sorted(tuple(patch.get_center()) for patch in walls) == [(3, 2), (3, 3), (3, 4)]
     assert any(tuple(patch.get_center()) == (4, 4) and patch.get_alpha() for patch in axes.patches)
     assert axes.yaxis_inverted()  # y grows downwards
@@ -54,7 +65,7 @@ def test_the_grid_shows_walls_door_and_goal():
 
 def test_five_panels_name_their_questions_and_what_came_of_them(policy, tmp_path):
     panels = gridworld.five_panels(policy)
-    figure = plots.five_panels(panels)
+    figure = draw_panels(panels)
     figure.savefig(tmp_path / "five.png")
     *grids, colorbar = figure.axes
     assert len(grids) == 5
@@ -92,7 +103,7 @@ def test_five_panels_name_their_questions_and_what_came_of_them(policy, tmp_path
     ],
 )
 def test_the_line_below_a_grid_says_what_came_of_the_question(given, achieved, line):
-    figure = plots.five_panels([expert_panel(given=given, achieved=achieved)])
+    figure = draw_panels([expert_panel(given=given, achieved=achieved)])
     assert figure.axes[0].get_xlabel() == line
 
 
@@ -100,7 +111,7 @@ def test_trajectories_stay_in_their_cells():
     panel = expert_panel()
     points = np.concatenate([panel.states] * 3)  # three trajectories that share every cell
     axes = Figure().subplots()
-    plots.grid._draw_trajectories(axes, points, plots.style.time_colours(HORIZON))
+    _draw_trajectories(axes, points, time_colours(HORIZON))
     cells = coordinates(points[..., 0])
     ways = axes.collections
     lines = [way for way in ways if hasattr(way, "get_segments")]
@@ -114,14 +125,14 @@ def test_trajectories_stay_in_their_cells():
 
 def test_state_distributions_have_a_grid_for_each_step_with_its_probabilities(policy, tmp_path):
     answer = gridworld.predicted_states(policy)
-    figure = plots.state_distributions(answer)
+    figure = state_distributions(answer)
     figure.savefig(tmp_path / "states.png")
     *grids, colorbar = figure.axes
     titles = [axes.get_title() for axes in grids]
     assert titles == [f"s[{at}]" + "  shown" * (at in gridworld.SHOWN_STATES) for at in range(HORIZON)]
     agent = answer["s"][0].probabilities[0].numpy()
     for at, axes in enumerate(grids):
-        expected = [f"{p:.2f}" for p in agent[at] if p >= plots.LEAST]
+        expected = [f"{p:.2f}" for p in agent[at] if p >= LEAST]
         assert texts_of(axes) == expected
     assert "probability" in colorbar.get_ylabel()
     assert legend_of(figure)[-1] == "shown"
@@ -130,14 +141,14 @@ def test_state_distributions_have_a_grid_for_each_step_with_its_probabilities(po
 def test_state_distributions_need_an_answer_about_every_state(policy):
     answer = policy.infer(None, "s[1] | s[0]", given={"s[0]": gridworld.START})
     with pytest.raises(ValueError, match=r"every state.*s\[2\]"):
-        plots.state_distributions(answer)
+        state_distributions(answer)
 
 
 def test_a_mask_diagram_marks_every_token():
     mask = tabulate("a[t] | s[:t+1], a[:t], s[-1], rtg[0]", ("s", "a", "rtg"), 6).at(2)
-    figure = plots.mask_diagram(mask)
+    figure = mask_diagram(mask)
     axes = figure.axes[0]
-    styles = {to_rgba(plots.SHOWN["facecolor"]): "#", to_rgba(plots.ASKED["facecolor"]): "?"}
+    styles = {to_rgba(SHOWN["facecolor"]): "#", to_rgba(ASKED["facecolor"]): "?"}
     tokens = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
     drawn = "".join(styles.get(token.get_facecolor(), ".") for token in tokens)
     rows = [f"{name} {drawn[6 * row : 6 * row + 6]}" for row, name in enumerate(("s", "a", "rtg"))]
@@ -149,7 +160,7 @@ def test_a_mask_diagram_marks_every_token():
 
 def test_a_long_window_keeps_the_figure_s_width():
     mask = tabulate("behavior_cloning", ("s", "a"), 200).at(100)
-    assert plots.mask_diagram(mask).get_size_inches()[0] == plots.WIDTH
+    assert mask_diagram(mask).get_size_inches()[0] == WIDTH
 
 
 # --- Samples, marginals and mazes ------------------------------------------------------------------------------------
@@ -162,7 +173,7 @@ def expert_states(episodes):
 
 def test_trajectories_have_a_grid_for_each_group(tmp_path):
     states = expert_states(40)
-    figure = plots.trajectories({"one": states[:20], "two": states[20:]}, captions=["a", "b"], cell=0, most=15)
+    figure = trajectories({"one": states[:20], "two": states[20:]}, captions=["a", "b"], cell=0, most=15)
     figure.savefig(tmp_path / "ways.png")
     one, two, colorbar = figure.axes
     assert [axes.get_title() for axes in (one, two)] == ["one", "two"]
@@ -176,7 +187,7 @@ def test_trajectories_have_a_grid_for_each_group(tmp_path):
             cells = np.stack(coordinates(way[:-1, 0]), axis=-1)
             assert (np.abs(points - cells) < 0.5).all()  # the jitter leaves no cell
     assert legend_of(figure)[-1] == "the cell in question"
-    assert "the cell in question" not in legend_of(plots.trajectories({"one": states}))
+    assert "the cell in question" not in legend_of(trajectories({"one": states}))
 
 
 def test_marginals_show_every_component_that_is_asked(policy, tmp_path):
@@ -186,7 +197,7 @@ def test_marginals_show_every_component_that_is_asked(policy, tmp_path):
         torch.ones(1, HORIZON, dtype=torch.bool),
     )
     answer = policy.infer(window, "s[1:8], a[:3] | s[0]")
-    figure = plots.marginals(answer, window)
+    figure = marginals(answer, window)
     figure.savefig(tmp_path / "marginals.png")
     *rows, colorbar = figure.axes
     assert [axes.get_ylabel() for axes in rows] == ["s: agent_cell", "s: key_cell", "a: direction"]
@@ -197,8 +208,8 @@ def test_marginals_show_every_component_that_is_asked(policy, tmp_path):
     truth = rows[0].collections[0].get_offsets()
     np.testing.assert_array_equal(truth, [[step, states[0, step, 0]] for step in range(1, 8)])
     assert legend_of(figure) == ["shown", "recorded"]
-    assert legend_of(plots.marginals(answer)) == ["shown"]
-    assert len(plots.marginals(policy.infer(window, "a[0] | s[0]")).axes) == 2  # states are not asked
+    assert legend_of(marginals(answer)) == ["shown"]
+    assert len(marginals(policy.infer(window, "a[0] | s[0]")).axes) == 2  # states are not asked
 
 
 @pytest.mark.parametrize("kind", ["continuous", "gaussian"])
@@ -206,7 +217,7 @@ def test_marginals_of_numbers_are_lines(kind, tiny_policy, continuous_batch):
     policy = tiny_policy(kind)
     window = policy.make_window(continuous_batch)
     answer = policy.infer(window, "s[1:8] | s[0]")
-    (axes,) = plots.marginals(answer, window, window=2).axes
+    (axes,) = marginals(answer, window, window=2).axes
     assert [line.get_ydata()[4] for line in axes.lines] == pytest.approx(answer["s"][0].mean[2, 4].tolist())
     bands = [band for band in axes.collections if type(band).__name__ == "FillBetweenPolyCollection"]
     assert len(bands) == (3 if kind == "gaussian" else 0)
@@ -220,7 +231,7 @@ def test_distributions_are_shares_of_each_group(policy, tiny_policy, continuous_
     actions[:, 3] = torch.nan
     recorded = Window({"s": states, "a": actions}, valid)
     shifted = Window({"s": 15 - states, "a": actions}, valid)
-    figure = plots.distributions({"recorded": recorded, "shifted": shifted}, policy.factors)
+    figure = distributions({"recorded": recorded, "shifted": shifted}, policy.factors)
     agent, key, direction = figure.axes
     assert [axes.get_xlabel() for axes in (agent, key, direction)] == ["s: agent_cell", "s: key_cell", "a: direction"]
     assert legend_of(figure) == ["recorded", "shifted"]
@@ -230,11 +241,11 @@ def test_distributions_are_shares_of_each_group(policy, tiny_policy, continuous_
     assert sum(bar.get_height() for bar in direction.patches) == pytest.approx(2)
     continuous = tiny_policy("continuous")
     window = continuous.make_window(continuous_batch)
-    labels = [axes.get_xlabel() for axes in plots.distributions({"all": window}, continuous.factors).axes]
+    labels = [axes.get_xlabel() for axes in distributions({"all": window}, continuous.factors).axes]
     assert labels[:5] == ["s: state[0]", "s: state[1]", "s: state[2]", "a: action[0]", "a: action[1]"]
     nothing = Window({name: values * torch.nan for name, values in window.values.items()}, window.valid)
     with pytest.raises(ValueError, match="nothing to draw"):
-        plots.distributions({"all": window, "none": nothing}, continuous.factors)
+        distributions({"all": window, "none": nothing}, continuous.factors)
 
 
 MAZE = {
@@ -253,7 +264,7 @@ def test_maze_trajectories_stand_over_the_walls(kind, tiny_policy, tmp_path):
     states = torch.tensor([[4.8 - 0.05 * step, 0.8, 3.0, 2.0] for step in range(10)])[None]
     window = Window({"s": states, "a": torch.zeros(1, 10, 2)}, torch.ones(1, 10, dtype=torch.bool))
     answer = policy.infer(window, "s[:] | s[0], s[5]")
-    figure = plots.maze_trajectories(answer, window)
+    figure = maze_trajectories(answer, window)
     figure.savefig(tmp_path / "maze.png")
     whole, close = figure.axes
     for axes in (whole, close):
@@ -265,6 +276,6 @@ def test_maze_trajectories_stand_over_the_walls(kind, tiny_policy, tmp_path):
         ellipse, scale = ellipses[0], answer["s"][0].scale[0, 1]
         assert (ellipse.width, ellipse.height) == pytest.approx((4 * scale[0].item(), 4 * scale[1].item()))
     assert ("two scales around it" in legend_of(figure)) == (kind == "gaussian")
-    walls = [patch for patch in whole.patches if patch.get_facecolor() == to_rgba(plots.WALL)]
+    walls = [patch for patch in whole.patches if patch.get_facecolor() == to_rgba(WALL)]
     assert min(patch.get_center()[0] for patch in walls) == pytest.approx(-0.2)  # D4RL's quirk, see envs/maze2d.py
     assert len(walls) == MAZES["medium"].count("#")

@@ -17,8 +17,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from lerobot_unimask import TASKS, MaskError, UniMASKConfig, UniMASKPolicy, Window
-from lerobot_unimask.inference import ORDERS
-from lerobot_unimask.training_masks import TrainingMasks, mixture
+from lerobot_unimask.asking.sampling import ORDERS
+from lerobot_unimask.language.training_masks import TrainingMasks, mixture
 
 KINDS = ("doorkey", "continuous", "gaussian")
 LAYOUTS = {

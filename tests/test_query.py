@@ -8,12 +8,14 @@ import pytest
 import torch
 from PIL import Image
 
-from lerobot_unimask import cli, hub, query
-from lerobot_unimask.envs.doorkey import DynamicsCheck, expert_probabilities
-from lerobot_unimask.envs.maze2d import parse_maze
-from lerobot_unimask.experiments.optimum import exact_answer
-from lerobot_unimask.masks import tabulate
+from lerobot_unimask import cli, query
+from lerobot_unimask.envs.doorkey.expert import expert_probabilities
+from lerobot_unimask.envs.doorkey.optimum import exact_answer
+from lerobot_unimask.envs.doorkey.rules import DynamicsCheck
+from lerobot_unimask.envs.maze2d.maze import parse_maze
+from lerobot_unimask.language.masks import tabulate
 from lerobot_unimask.query import Sampling
+from lerobot_unimask.sharing import hub
 
 MASK = "s[1:4], a[:2] | s[0], s[4]"
 

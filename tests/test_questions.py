@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from dataset_builders.doorkey import FEATURES, rollout
+from dataset_builders.doorkey import FEATURES
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy, cli
-from lerobot_unimask.envs.doorkey import HORIZON, START_PAIRS
-from lerobot_unimask.experiments import questions
-from lerobot_unimask.experiments.optimum import Optimum
+from lerobot_unimask.envs.doorkey.episodes import rollout
+from lerobot_unimask.envs.doorkey.optimum import Optimum
+from lerobot_unimask.envs.doorkey.rules import HORIZON, START_PAIRS
+from lerobot_unimask.paper import questions
 
 CORNER = {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]}
 

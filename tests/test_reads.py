@@ -22,8 +22,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader, Subset, default_collate
 from torch.utils.data._utils.pin_memory import pin_memory
 
-from lerobot_unimask import reads
-from lerobot_unimask.reads import Item, Windows, install
+from lerobot_unimask.data import reads
+from lerobot_unimask.data.reads import Item, Windows, install
 
 FPS = 10
 K = 10

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import TASKS
-from lerobot_unimask.experiments import ablation, heatmap, table
+from lerobot_unimask.paper import ablation, heatmap, table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_unimask.returns import return_to_go
+from lerobot_unimask.data.returns import return_to_go
 
 
 def test_equals_a_loop_over_steps():

@@ -10,8 +10,8 @@ import optuna
 import pytest
 
 from lerobot_unimask import cli
-from lerobot_unimask.experiments.search import SearchConfig, best, draw, markdown, nested, search
-from lerobot_unimask.experiments.study import read_config
+from lerobot_unimask.paper.search import SearchConfig, best, draw, markdown, nested, search
+from lerobot_unimask.paper.study import read_config
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 PAPER = read_config(SearchConfig, CONFIGS / "search.yaml").space

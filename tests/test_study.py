@@ -14,8 +14,8 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from lerobot_unimask.experiments import study as module
-from lerobot_unimask.experiments.study import key, run_study
+from lerobot_unimask.paper import study as module
+from lerobot_unimask.paper.study import key, run_study
 
 RUNS = [{"row": "row", "episodes": episodes, "seed": seed} for episodes in (50, 500) for seed in range(6)]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import cli
-from lerobot_unimask.experiments.study import read_config
-from lerobot_unimask.experiments.table import FINETUNED, ROWS, TableConfig, markdown, paper_returns, summary
+from lerobot_unimask.paper.study import read_config
+from lerobot_unimask.paper.table import FINETUNED, ROWS, TableConfig, markdown, paper_returns, summary
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 

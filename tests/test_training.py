@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_unimask import UniMASKPolicy
-from lerobot_unimask.experiments.training import Trainer
+from lerobot_unimask.training import Trainer
 
 SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "device": "cpu"}
 

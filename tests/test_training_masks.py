@@ -7,8 +7,9 @@ import torch
 from test_masks import slow_table
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from lerobot_unimask.masks import RANDOM_MASK, TASKS, MaskError, tabulate
-from lerobot_unimask.training_masks import TrainingMasks, counter_uniform, mixture
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import RANDOM_MASK, TASKS, tabulate
+from lerobot_unimask.language.training_masks import TrainingMasks, counter_uniform, mixture
 
 FACTORS = ("s", "a", "rtg")
 

@@ -12,11 +12,12 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask import TASKS, UniMASKPolicy
-from lerobot_unimask.experiments.validation import checkpoints_of, first_windows, task_losses, validate
-from lerobot_unimask.masks import RANDOM_MASK, Mask
-from lerobot_unimask.modeling_unimask import VALIDATION_STEP
-from lerobot_unimask.reads import ENVIRONMENT_VARIABLE
-from lerobot_unimask.training_masks import TrainingMasks
+from lerobot_unimask.data.checkpoints import checkpoints_of
+from lerobot_unimask.data.episodes import first_windows, open_dataset
+from lerobot_unimask.data.reads import ENVIRONMENT_VARIABLE
+from lerobot_unimask.language.masks import RANDOM_MASK, Mask
+from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
+from lerobot_unimask.validation import task_losses, validate
 
 ALL = (*TASKS, RANDOM_MASK)
 EPISODES = 30  # of the dataset in conftest
@@ -24,7 +25,7 @@ EPISODES = 30  # of the dataset in conftest
 
 @pytest.fixture(scope="module")
 def batch(tiny_policy, doorkey_root):
-    return first_windows(tiny_policy(), doorkey_root, "local/doorkey")
+    return first_windows(open_dataset(tiny_policy().config, doorkey_root))
 
 
 def scaled(policy: UniMASKPolicy, scale: float) -> UniMASKPolicy:
@@ -47,14 +48,14 @@ def test_there_is_one_window_for_each_episode_from_its_first_step(batch, doorkey
 
 def test_the_windows_do_not_depend_on_how_they_are_read(tiny_policy, doorkey_root, batch, monkeypatch) -> None:
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, "0")
-    again = first_windows(tiny_policy(), doorkey_root, "local/doorkey")
+    again = first_windows(open_dataset(tiny_policy().config, doorkey_root))
     assert again.keys() == batch.keys()
     assert all(torch.equal(again[key], value) for key, value in batch.items() if isinstance(value, torch.Tensor))
 
 
 def test_a_missing_dataset_is_not_sought_on_the_hub(tiny_policy, tmp_path) -> None:
     with pytest.raises(FileNotFoundError, match=r"holds no LeRobotDataset"):
-        first_windows(tiny_policy(), tmp_path, "local/doorkey")
+        first_windows(open_dataset(tiny_policy().config, tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -164,7 +165,7 @@ def test_of_each_run_the_checkpoint_with_the_lowest_random_mask_loss_counts(runs
         by_updates = {}
         for path in checkpoints_of(run):
             policy = UniMASKPolicy.from_pretrained(path)
-            by_updates[int(policy.updates)] = task_losses(policy, first_windows(policy, data, "local/doorkey"), ALL)
+            by_updates[int(policy.updates)] = task_losses(policy, first_windows(open_dataset(policy.config, data)), ALL)
         assert result["random_mask_loss_by_updates"] == {
             updates: losses[RANDOM_MASK] for updates, losses in by_updates.items()
         }

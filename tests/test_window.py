@@ -5,7 +5,8 @@ import copy
 import pytest
 import torch
 
-from lerobot_unimask.window import Feature, Statistics, Window, make_factors, make_window
+from lerobot_unimask.data.factors import Feature, make_factors
+from lerobot_unimask.data.window import Statistics, Window, make_window
 
 K = 4
 FEATURES = {

@@ -9,5 +9,5 @@ from lerobot_unimask.envs.configs import DoorKeyEnvConfig, Maze2DEnvConfig
 
 __all__ = ["DoorKeyEnvConfig", "Maze2DEnvConfig"]
 
-register(id="lerobot_unimask/DoorKey-v0", entry_point="lerobot_unimask.envs.doorkey:DoorKeyEnv")
-register(id="lerobot_unimask/Maze2D-v0", entry_point="lerobot_unimask.envs.maze2d:Maze2DEnv")
+register(id="lerobot_unimask/DoorKey-v0", entry_point="lerobot_unimask.envs.doorkey.environment:DoorKeyEnv")
+register(id="lerobot_unimask/Maze2D-v0", entry_point="lerobot_unimask.envs.maze2d.environment:Maze2DEnv")

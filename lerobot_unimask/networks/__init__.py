@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
+from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.networks.decision_gpt import DecisionGPT
 from lerobot_unimask.networks.decision_transformer import DecisionTransformer
 from lerobot_unimask.networks.feedforward import FeedForward
 from lerobot_unimask.networks.transformer import Transformer
-from lerobot_unimask.window import Factor
 
 if TYPE_CHECKING:
     from lerobot_unimask.configuration_unimask import UniMASKConfig

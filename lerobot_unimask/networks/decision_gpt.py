@@ -5,8 +5,10 @@ Legend of shapes: B windows, K steps.
 
 from torch import Tensor
 
-from lerobot_unimask.networks.transformer import Cache, Predictions, Transformer
-from lerobot_unimask.window import Factor, Window
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.networks.layers import Cache, Predictions
+from lerobot_unimask.networks.transformer import Transformer
 
 
 class DecisionGPT(Transformer):

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_unimask.masks import ASKABLE
-from lerobot_unimask.networks.transformer import Block, Cache, FactorEmbedding, Heads, Predictions
-from lerobot_unimask.window import Factor, Window
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import ASKABLE
+from lerobot_unimask.networks.layers import Block, Cache, FactorEmbedding, Heads, Predictions
 
 # Rows of the timestep embedding, as in the original: an episode's steps, or thousandths of a longer one
 TIMESTEPS = 1000

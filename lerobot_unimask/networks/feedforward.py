@@ -8,9 +8,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from lerobot_unimask.masks import ASKABLE
-from lerobot_unimask.networks.transformer import Cache, FactorEmbedding, Heads, Predictions
-from lerobot_unimask.window import Factor, Window
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import ASKABLE
+from lerobot_unimask.networks.layers import Cache, FactorEmbedding, Heads, Predictions
 
 
 class FeedForward(nn.Module):

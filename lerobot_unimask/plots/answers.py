@@ -10,8 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from lerobot_unimask.inference import Answer, Distribution
-from lerobot_unimask.masks import ASKABLE, Mask
+from lerobot_unimask.asking.answers import Answer, Distribution
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import ASKABLE, Mask
 from lerobot_unimask.plots.style import (
     ASKED,
     BLACK,
@@ -28,7 +30,6 @@ from lerobot_unimask.plots.style import (
     WIDTH,
     shown_handle,
 )
-from lerobot_unimask.window import Factor, Window
 
 
 def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:

@@ -1,0 +1,130 @@
+"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+
+Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
+
+Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import Mask, parse_token
+
+Given = Mapping[str, Any]  # token text -> its value, shared (D,) or one per environment (B, D); a number where D = 1
+
+
+def read_given(
+    given: Given, factors: Mapping[str, Factor], context_length: int, batch_size: int | None = None
+) -> dict[tuple[str, int], Tensor]:
+    """Check what a user gives: (factor, position) -> (B, D) or (1, D), D as the user counts it, without computed parts.
+
+    Args:
+        batch_size: B; None where it is not known yet, and any number of rows will do.
+
+    Raises:
+        MaskError: a key that is not a token of the window.
+        ValueError: a value of the wrong size, not finite, or not one of the categories.
+    """
+    tokens = {}
+    for text, value in given.items():
+        name, step = parse_token(text, tuple(factors), context_length)
+        if (name, step) in tokens:
+            raise ValueError(f"{name}[{step}] is given twice, the second time as {text}.")
+        tokens[name, step] = _token(text, value, factors[name], batch_size)
+    return tokens
+
+
+def give(
+    window: Window, tokens: Mapping[tuple[str, int], Tensor], known: Mapping[str, Tensor]
+) -> tuple[Window, dict[str, Tensor]]:
+    """The window with the given tokens where nothing has been observed, and which tokens are known then.
+
+    Args:
+        tokens: as `read_given` returns them.
+        known: factor -> (K,) bool, True where the window holds an observed value, which wins over a given one.
+    """
+    values, known = dict(window.values), dict(known)
+    for (name, step), value in tokens.items():
+        if not known[name][step]:
+            values[name], known[name] = values[name].clone(), known[name].clone()
+            values[name][:, step, : value.shape[-1]] = value.to(window.valid.device)
+            known[name][step] = True
+    return Window(values, window.valid), known
+
+
+def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
+    """(B, given_size) or (1, given_size), checked."""
+    size = factor.given_size
+    try:
+        token = torch.as_tensor(value, dtype=torch.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}.") from error
+    if token.ndim == 0 or (token.ndim == 1 and size == 1 and token.shape[0] in (B or token.shape[0], 1)):
+        token = token.reshape(-1, 1)
+    elif token.ndim == 1:
+        token = token.unsqueeze(0)
+    if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B or token.shape[0]):
+        each = "each window or environment" if B is None else f"each of the {B} windows or environments"
+        raise ValueError(
+            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or one such row for {each}."
+        )
+    check_values(f"{text} is given {value!r}, which", token, factor)
+    return token
+
+
+def check_values(what: str, values: Tensor, factor: Factor) -> None:
+    """Values of a factor, (..., D) or without its computed numbers, must be finite, and categories where discrete.
+
+    Raises:
+        ValueError: they are not; names `what` and the first bad value.
+    """
+    fine = values.isfinite()
+    if not fine.all():
+        raise ValueError(f"{what} holds {values[~fine][0].item()}; its numbers must be finite.")
+    for component in factor.components:
+        if component.discrete:
+            numbers = values[..., component.dims]
+            bad = (numbers < 0) | (numbers >= component.categories) | (numbers != numbers.round())
+            if bad.any():
+                raise ValueError(
+                    f"{what} holds {numbers[bad][0].item():g}; {component.name} is a category from 0 to "
+                    f"{component.categories - 1}."
+                )
+
+
+def check_shown(tokens: Iterable[tuple[str, int]], visible: Mapping[str, Tensor], text: str) -> None:
+    """A given token must be one that the mask shows, (..., K) bool for each factor, or giving it changes nothing.
+
+    Raises:
+        ValueError: the mask does not show it.
+    """
+    for name, step in tokens:
+        if not visible[name][..., step].any():
+            raise ValueError(
+                f"{name}[{step}] is given, but the mask does not show it:\n  {text}\n"
+                f"Add {name}[{step}] after the bar, or do not give it."
+            )
+
+
+def check_known(mask: Mask, known: Mapping[str, Tensor], text: str) -> None:
+    """Everything that the mask shows must be known.
+
+    Raises:
+        ValueError: it shows a token that has been neither observed nor given.
+    """
+    missing = [
+        f"{name}[{step}]"
+        for name, shown in mask.visible.items()
+        for step in (shown.any(0).cpu() & ~known[name]).nonzero().flatten().tolist()
+    ]
+    if missing:
+        example = missing[0]
+        raise ValueError(
+            f"The mask shows {', '.join(missing)}, which has been neither observed nor given.\n  {text}\n"
+            f'Give its value, as in given={{"{example}": ...}}, or choose a mask that does not show it.'
+        )

@@ -1,0 +1,106 @@
+"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+
+Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
+
+Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import ASKABLE
+from lerobot_unimask.networks.layers import Cache
+
+
+class RolloutMemory:
+    """The last K states and actions of each environment in a batch, and the return each had received by then.
+
+    The present stands at position min(step, K - 1): before the window is full, later positions are empty; then it
+    slides.
+    """
+
+    @torch.inference_mode(False)
+    def __init__(self, factors: Mapping[str, Factor], context_length: int, batch_size: int, device: torch.device):
+        K = context_length
+        self.step = -1  # of the episode; nothing has been observed yet
+        self.acted = True  # the step has ended, so that the next observation begins another
+        self.values = {name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()}
+        self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
+        self.target_return: Tensor | None = None  # (B, 1) or (1, 1): asked for from the first step on
+        self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
+        self.cache = Cache()  # of the steps in the window, until it slides
+
+    @property
+    def position(self) -> int:
+        """Where the present stands in the window."""
+        return min(self.step, self.valid.shape[1] - 1)
+
+    @property
+    def first_step(self) -> int:
+        """The episode's step at position 0."""
+        return self.step - self.position
+
+    @torch.inference_mode(False)  # LeRobot acts in inference mode; what is remembered outlives it
+    def observe(self, state: Tensor, return_so_far: Tensor | None) -> None:
+        """Begin a step: (B, D) of `s`, and (B,) the rewards received so far, where the environment reports them.
+
+        Where the last step found no action, because its question was refused, it begins again.
+        """
+        K = self.valid.shape[1]
+        if self.acted:
+            self.step += 1
+            if self.step >= K:
+                for name in ASKABLE:
+                    self.values[name] = self.values[name].roll(-1, dims=1)
+                self.return_so_far = self.return_so_far.roll(-1, dims=1)
+                self.cache = Cache()
+            self.acted = False
+        self.values["s"][:, self.position] = state.clone()
+        self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
+
+    @torch.inference_mode(False)
+    def act(self, action: Tensor) -> None:
+        """End the step: (B, D) of `a`."""
+        self.values["a"][:, self.position] = action.clone()
+        self.acted = True
+
+    def known(self) -> dict[str, Tensor]:
+        """factor -> (K,) bool: states up to the present, actions before it."""
+        steps = torch.arange(self.valid.shape[1])
+        before = {"s": steps <= self.position, "a": steps < self.position}
+        return {name: before.get(name, torch.zeros_like(steps, dtype=torch.bool)) for name in self.values}
+
+    def window(self, horizon: Tensor) -> Window:
+        """The window as it stands; the return token knows its timestep, its return is for `give` to fill in."""
+        values = dict(self.values)
+        if "rtg" in values:
+            values["rtg"] = values["rtg"].clone()
+            values["rtg"][..., -1] = (self.first_step + torch.arange(self.valid.shape[1]).to(horizon)) / horizon
+        return Window(values, self.valid)
+
+    def carry_return(self, window: Window) -> None:
+        """Write into a window what is left of its first step's return at the later steps, NaN where nobody has reported
+        the rewards since. No mask shows it; a Decision Transformer reads it."""
+        if "rtg" in window.values:
+            received = self.return_so_far[:, 1:] - self.return_so_far[:, :1]  # (B, K - 1)
+            window.values["rtg"][:, 1:, 0] = window.values["rtg"][:, :1, 0] - received
+
+    def remaining(self, target_return: Tensor) -> Tensor:
+        """What is left of the target return at the window's first step, (B, 1).
+
+        Raises:
+            ValueError: the window has slid and the environment never reported the return so far.
+        """
+        if self.first_step == 0:
+            return target_return.expand(len(self.valid), 1)
+        received = self.return_so_far[:, :1]
+        if received.isnan().any():
+            raise ValueError(
+                "Asking for a return needs the environment to report what it has paid so far, as "
+                "'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
+            )
+        return target_return - received

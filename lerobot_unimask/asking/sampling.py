@@ -1,0 +1,140 @@
+"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+
+Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
+
+Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.asking.answers import Predict, answer
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.window import Statistics, Window
+from lerobot_unimask.language.masks import ASKABLE, Mask
+
+ORDERS = ("forward", "backward", "random")
+
+# (values, decided): factor -> (n, K, D) and (n, K) bool -> (n,) bool, False where the decided tokens contradict it
+Check = Callable[[Mapping[str, Tensor], Mapping[str, Tensor]], Tensor]
+
+
+class RejectionError(ValueError):
+    """No sample passed the check in as many tries as it was given."""
+
+
+@dataclass
+class Samples(Window):
+    """Drawn windows: shown and drawn values, NaN elsewhere; and what the check cost.
+
+    drawn: tokens drawn, those that the check rejected included.
+    rejected: of these, how many it rejected.
+    restarted: how often a sample started over because no value of a token passed the check.
+    """
+
+    drawn: int = 0
+    rejected: int = 0
+    restarted: int = 0
+
+    @property
+    def acceptance(self) -> float:
+        """The share of drawn tokens that the check accepted."""
+        return 1 - self.rejected / max(self.drawn, 1)
+
+
+def sample(
+    predict: Predict,
+    statistics: Statistics,
+    factors: Mapping[str, Factor],
+    window: Window,
+    mask: Mask,
+    *,
+    order: str,
+    generator: torch.Generator,
+    check: Check | None = None,
+    tries: int = 100,
+) -> Samples:
+    """Draw the asked-for tokens one after another, each given the shown ones and those already drawn (chain rule).
+
+    A token's own components (agent and key, say) are drawn side by side from their marginals. With a check, a token
+    that contradicts what is shown or already drawn is drawn again (the paper's repair of backward inference, appendix
+    "Fixing prediction inconsistencies"), and a sample in a dead end starts over.
+
+    Note: Rejection looks at what is decided so far and not ahead, so the accepted samples are not quite distributed as
+        all samples that happen to pass are.
+
+    Args:
+        order: `forward` in time (s0, a0, s1, ...), `backward`, or `random` (one order for the whole batch).
+        check: tells which samples contradict themselves; called after each drawn token with the samples that drew it.
+        tries: how often one token is drawn before its sample starts over, and how often a sample starts before all is
+            given up.
+
+    Raises:
+        ValueError: an unknown order, or a check that what is shown fails.
+        RejectionError: one that every start of some sample fails.
+    """
+    if order not in ORDERS:
+        raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
+    if tries < 1:
+        raise ValueError(f"tries is {tries}; it must be at least 1.")
+    asked = torch.stack([mask.predict[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
+    tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
+    if order == "backward":
+        tokens.reverse()
+    elif order == "random":
+        shuffle = torch.randperm(len(tokens), generator=generator, device=generator.device).tolist()
+        tokens = [tokens[i] for i in shuffle]
+    shown = {name: visible.unsqueeze(-1) for name, visible in mask.visible.items()}
+    samples = Samples({name: torch.where(shown[name], v, torch.nan) for name, v in window.values.items()}, window.valid)
+    if check is not None and not check(samples.values, mask.visible).all():
+        raise ValueError(
+            "By the check what is shown is impossible already, so no sample can pass: show something else."
+        )
+
+    def start(rows: Tensor) -> Tensor:
+        """Draw all tokens of some samples, (n,) their numbers, and return those that got stuck."""
+        stuck = [rows[:0]]
+        values = {name: value[rows] for name, value in samples.values.items()}
+        visible = {name: shown[rows] for name, shown in mask.visible.items()}
+        for name, step in tokens:
+            here = torch.zeros_like(visible[name])
+            here[:, step] = mask.predict[name][rows, step]
+            nothing = {other: torch.zeros_like(here) for other in visible}
+            posed = Mask(visible, nothing | {name: here})
+            said = answer(predict, statistics, factors, Window(values, samples.valid[rows]), posed)
+            visible = visible | {name: visible[name] | here}
+            redraw = here[:, step].nonzero().squeeze(-1)
+            for _ in range(tries):
+                value = torch.cat([distribution.at(redraw, step).draw(generator) for distribution in said[name]], -1)
+                values[name][redraw, step] = value[:, 0]
+                samples.drawn += len(redraw)
+                redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(visible, redraw))]
+                samples.rejected += len(redraw)
+                if len(redraw) == 0:
+                    break
+            else:
+                going_on = torch.ones_like(rows, dtype=torch.bool).index_fill(0, redraw, False)
+                stuck.append(rows[~going_on])
+                values, visible, rows = _rows(values, going_on), _rows(visible, going_on), rows[going_on]
+        for name in ASKABLE:
+            samples.values[name][rows] = values[name]
+        return torch.cat(stuck)
+
+    rows = torch.arange(len(window.valid), device=window.valid.device)
+    for _ in range(tries):
+        rows = start(rows)
+        if len(rows) == 0:
+            return samples
+        samples.restarted += len(rows)
+    raise RejectionError(
+        f"{len(rows)} of {len(window.valid)} samples did not pass the check, each started {tries} times; it rejected "
+        f"{samples.rejected} of {samples.drawn} drawn tokens. The model finds what is shown hard to reconcile with it: "
+        "show something likelier, draw in another order, or raise tries."
+    )
+
+
+def _rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    return {name: tensor[rows] for name, tensor in tensors.items()}

@@ -1,0 +1,120 @@
+"""`unimask bench`: how fast this machine reads, trains, acts, evaluates and builds, each beside its baseline.
+
+Every measurement runs in a process of its own, so that its peak memory is its own. These processes are forked from one
+that has imported everything and computed nothing; what such a process occupies is in the record as `imports`. Weights
+are untrained, which costs the same. With a GPU, clocks wait for it and its peak memory is recorded too; that has not
+been tried for want of one.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+
+def targets(record: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
+    """What was promised: the quantity, its bound, what was measured, and whether it keeps the bound."""
+    share = record["training"]["doorkey"]["share"]
+    waiting = share["data"] + share["masks"]
+    latency = record["acting"]["unimask"]["1"]["latency_ms"]["median"]
+    rollout = record["evaluating"]["ms_per_rollout"]
+    plain = record["building"]["stepping"]["ms_per_episode"]["median"]
+    times = rollout["total"] / (plain + rollout["forward"])
+    return [
+        ("DoorKey training: share of waiting for data and drawing masks", "< 5 %", f"{waiting:.1%}", waiting < 0.05),
+        ("Maze2D, one environment, one thread: `select_action`", "< 3 ms", f"{latency:.1f} ms", latency < 3),
+        ("lerobot-eval beside plain stepping and forward passes", "≤ 2 times", f"{times:.2f} times", times <= 2),
+    ]
+
+
+def markdown(record: Mapping[str, Any]) -> str:
+    """The record as the README's tables."""
+    found = record["machine"]
+    gpu = f", {found['gpu']}" if found["gpu"] else ", no GPU"
+    lines = [
+        f"{found['processor']}, {found['cores']} cores, {found['memory_gib']:.0f} GiB{gpu}; torch "
+        f"{record['versions']['torch']}, LeRobot {record['versions']['lerobot']}. Memory is each process's peak, "
+        f"of which {record['imports']['peak_memory_mib']} MiB are imports.",
+        "",
+        "| target | bound | measured | |",
+        "| --- | --- | --- | --- |",
+        *(
+            f"| {what} | {bound} | {measured} | {'met' if met else 'missed'} |"
+            for what, bound, measured, met in targets(record)
+        ),
+        "",
+        "| median (quartiles) | this package | MiB | baseline | MiB | baseline is |",
+        "| --- | --- | --- | --- | --- | --- |",
+        *_beside_baselines(record),
+        "",
+        "| lerobot-train | ms per step | data | masks | forward | backward | optimiser | rest | MiB |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for name, run in record["training"].items():
+        shares = " | ".join(f"{share:.1%}" for share in run["share"].values())
+        lines.append(f"| {name} | {_text(run['step_ms'])} | {shares} | {run['peak_memory_mib']} |")
+    counts = list(record["acting"]["unimask"])
+    lines += [
+        "",
+        "| `select_action`, ms | " + " | ".join(f"{n} environment{'s' * (n != '1')}" for n in counts) + " | MiB |",
+        "| --- " * (len(counts) + 2) + "|",
+    ]
+    for name, runs in record["acting"].items():
+        one = runs[counts[0]]
+        how = f", {one['passes']} passes" if one["passes"] > 1 else ""
+        how += f", by default for {one['actions_per_chunk']} steps" if one["actions_per_chunk"] > 1 else ""
+        cells = " | ".join(_text(runs[n]["latency_ms"]) for n in counts)
+        memory = max(run["peak_memory_mib"] for run in runs.values())
+        lines.append(f"| {name} ({one['parameters'] / 1e6:.1f} M parameters{how}) | {cells} | {memory} |")
+    rollout = record["evaluating"]["ms_per_rollout"]
+    lines += [
+        "",
+        f"Of a rollout's {rollout['total']:.0f} ms in lerobot-eval the network takes {rollout['forward']:.0f}, the "
+        f"rest of acting {rollout['acting']:.1f}, the environment {rollout['environment']:.1f}, LeRobot and gymnasium "
+        f"{rollout['lerobot']:.1f}.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _beside_baselines(record: Mapping[str, Any]) -> Iterator[str]:
+    read, build, rolled = record["reading"], record["building"], record["evaluating"]
+    train = record["training"]
+    per_second = {name: {"median": 1000 / build[name]["ms_per_episode"]["median"]} for name in build}
+    rows = [
+        (
+            "windows read per second",
+            (read["unimask"]["windows_per_second"], read["unimask"]),
+            (read["lerobot"]["windows_per_second"], read["lerobot"]),
+            "LeRobot, item by item",
+        ),
+        (
+            "DoorKey training steps per second",
+            ({"median": train["doorkey"]["steps_per_second"]}, train["doorkey"]),
+            ({"median": train["doorkey, LeRobot's reads"]["steps_per_second"]}, train["doorkey, LeRobot's reads"]),
+            "the same, read item by item",
+        ),
+        (
+            "Maze2D episodes built per second",
+            (per_second["building"], build["building"]),
+            (per_second["stepping"], build["stepping"]),
+            "stepping the environment alone",
+        ),
+        (
+            "Maze2D rollouts evaluated per second",
+            ({"median": rolled["rollouts_per_second"]}, rolled),
+            (per_second["stepping"], build["stepping"]),
+            "stepping the environment alone",
+        ),
+    ]
+    for what, (ours, our_run), (theirs, their_run), baseline in rows:
+        memory = our_run["peak_memory_mib"], their_run["peak_memory_mib"]
+        yield f"| {what} | {_text(ours)} | {memory[0]} | {_text(theirs)} | {memory[1]} | {baseline} |"
+
+
+def _text(found: Mapping[str, Any]) -> str:
+    """The median, with quartiles where they are known."""
+    quartiles = found.get("quartiles")
+    return _number(found["median"]) + (f" ({_number(quartiles[0])} to {_number(quartiles[1])})" if quartiles else "")
+
+
+def _number(value: float) -> str:
+    """Three digits."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"

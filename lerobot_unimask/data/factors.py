@@ -1,0 +1,152 @@
+"""A dataset's columns -> the factors of the mask language: `s`, `a`, `rtg` and the properties."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import PolicyFeature
+from lerobot.utils.constants import OBS_PREFIX
+
+STATE = "observation.state"
+ENVIRONMENT_STATE = "observation.environment_state"
+ACTION = "action"
+RETURN_TO_GO = "observation.return_to_go"
+RETURN_SO_FAR = "observation.return_so_far"
+TAKEN = (STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are factors already
+
+LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column of the dataset inside a factor, as the checkpoint's config stores it."""
+
+    key: str
+    size: int
+    categories: list[int] | None = None  # per dimension; None: continuous
+    names: list[str] | None = field(default=None, compare=False)  # per dimension, for people
+
+
+@dataclass(frozen=True)
+class Component:
+    """What one output head predicts: a single discrete dimension of a factor, or a run of continuous ones."""
+
+    name: str
+    dims: slice  # of the factor's D
+    categories: int | None  # None: continuous
+    computed: bool = False  # by this package, not stored in the dataset or given by a user
+    gaussian: bool = False  # continuous, predicted as a mean and a scale
+
+    @property
+    def discrete(self) -> bool:
+        return self.categories is not None
+
+    @property
+    def size(self) -> int:
+        """What a head puts out for it: logits; a mean for each dimension; or means, then the logarithms of scales."""
+        width = self.dims.stop - self.dims.start
+        return self.categories if self.discrete else 2 * width if self.gaussian else width
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What the mask language calls `s`, `a`, `rtg` or by a property's name."""
+
+    name: str
+    components: tuple[Component, ...]
+
+    @property
+    def size(self) -> int:
+        """D, the numbers of one token."""
+        return self.components[-1].dims.stop
+
+    @property
+    def given_size(self) -> int:
+        """The first of the D numbers, which a dataset stores and a user gives."""
+        return max(component.dims.stop for component in self.components if not component.computed)
+
+
+def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = False) -> dict[str, Factor]:
+    """The model's factors from the features that its config stores under each name.
+
+    Args:
+        gaussian: predict continuous components as a mean and a scale.
+    """
+    factors = {}
+    for name, columns in features.items():
+        components: list[Component] = []
+        start = 0
+        for feature in columns:
+            if feature.categories is None:
+                label = feature.key.removeprefix("observation.")
+                dims = slice(start, start + feature.size)
+                components.append(Component(label, dims, None, gaussian=gaussian))
+            else:
+                labels = feature.names or [
+                    f"{feature.key.removeprefix('observation.')}.{i}" for i in range(feature.size)
+                ]
+                for i, (label, count) in enumerate(zip(labels, feature.categories, strict=True)):
+                    components.append(Component(label, slice(start + i, start + i + 1), count))
+            start += feature.size
+        if name == "rtg":  # the token is the pair (return-to-go, timestep / horizon)
+            components.append(Component("timestep", slice(start, start + 1), None, computed=True))
+        factors[name] = Factor(name, tuple(components))
+    return factors
+
+
+def is_numeric(entry: dict[str, Any]) -> bool:
+    return entry["dtype"] not in ("image", "video", "string", "language") and len(entry["shape"]) <= 1
+
+
+def read_feature(key: str, entry: dict[str, Any]) -> Feature:
+    size = entry["shape"][0] if entry["shape"] else 1
+    categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
+    if categories is not None and len(categories) != size:
+        raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
+    names = entry.get("names")
+    names = list(names) if isinstance(names, list | tuple) and len(names) == size else None
+    return Feature(key, size, list(categories) if categories is not None else None, names)
+
+
+def declared_feature(key: str, feature: PolicyFeature) -> Feature:
+    return Feature(key, feature.shape[0] if feature.shape else 1)
+
+
+def group_features(found: dict[str, Feature], properties: Sequence[str]) -> dict[str, list[Feature]]:
+    """Which factor each column belongs to. `s` is what LeRobot calls the robot's and the environment's state: a label
+    of the episode under another name must never slip into it, for no environment reports one."""
+    states = [found[key] for key in (STATE, ENVIRONMENT_STATE) if key in found]
+    if not states:
+        raise ValueError(f"The dataset has no {STATE!r}: UniMASK models states and actions. It has {list(found)}.")
+    if ACTION not in found:
+        raise ValueError(f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}.")
+    features = {"s": states, "a": [found[ACTION]]}
+    if RETURN_TO_GO in found:
+        features["rtg"] = [found[RETURN_TO_GO]]
+    for key in properties:
+        name = key.rpartition(".")[-1]
+        if key not in found:
+            others = [other for other in found if other.startswith(OBS_PREFIX) and other not in TAKEN]
+            raise ValueError(
+                f"properties names {key!r}, which the dataset does not have; columns that could be one: "
+                f"{', '.join(others) or 'none'}. `unimask label` adds one."
+            )
+        if key in TAKEN or found[key] in features.get(name, []):
+            raise ValueError(f"{key!r} is a factor already, so it cannot be named in properties as well.")
+        if not key.startswith(OBS_PREFIX) or not re.fullmatch(r"[A-Za-z_]\w*", name) or name in ("t", "rtg", *features):
+            raise ValueError(
+                f"{key!r} cannot be a property: it is named observation.NAME, NAME is letters, digits and "
+                f"underscores, and s, a, t, rtg and other properties' names are taken."
+            )
+        features[name] = [found[key]]
+    return features
+
+
+def describe_features(features: dict[str, list[Feature]]) -> str:
+    kinds = (
+        f"{name} = {f.key} ({f.size} numbers{f', categories {f.categories}' if f.categories else ''})"
+        for name, columns in features.items()
+        for f in columns
+    )
+    return "; ".join(kinds)

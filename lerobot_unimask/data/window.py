@@ -1,0 +1,165 @@
+"""LeRobot batch -> Window: the factors of K steps as tensors, in the dataset's units.
+
+Legend of shapes: B windows, K steps, D the dimensions of a factor.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_unimask.data.factors import ACTION, LOG_SCALE, STATE, Component, Factor, Feature
+
+
+@dataclass
+class Window:
+    """K steps of B trajectories.
+
+    values: factor -> (B, K, D) float32, in the dataset's units; discrete values are category numbers. `rtg` holds
+        (return-to-go, timestep / horizon).
+    valid: (B, K) bool, False past the episode's end.
+    """
+
+    values: dict[str, Tensor]
+    valid: Tensor
+
+    def repeat(self, times: int) -> "Window":
+        """Each window `times` times, one after another."""
+        values = {name: value.repeat_interleave(times, dim=0) for name, value in self.values.items()}
+        return Window(values, self.valid.repeat_interleave(times, dim=0))
+
+    def to(self, device: torch.device) -> "Window":
+        return Window({name: value.to(device) for name, value in self.values.items()}, self.valid.to(device))
+
+
+def make_window(
+    batch: Mapping[str, Tensor],
+    features: Mapping[str, Sequence[Feature]],
+    context_length: int,
+    *,
+    horizon: Tensor,
+    fps: Tensor,
+    partial: bool = False,
+) -> Window:
+    """Read a window from a LeRobot batch, which is not changed.
+
+    Args:
+        batch: the dataset's keys, each (B, K, size) or, for features of one number, (B, K) or (B, K, 1);
+            `observation.state_is_pad` (B, K) if steps lie past the episode's end; `timestamp` (B,), seconds of step 0.
+        horizon: steps of an episode. With `fps` it turns the timestamp into the return token's timestep / horizon.
+        partial: columns may be missing, all but one; their values are NaN then.
+
+    Raises:
+        KeyError: a column that the model needs is missing.
+        ValueError: a column's shape is not (B, context_length, size).
+    """
+    values = {}
+    present = [feature.key for columns in features.values() for feature in columns if feature.key in batch]
+    for name, columns in features.items():
+        if partial and present:
+            like = batch[present[0]]
+            nothing = like.new_full((len(like), context_length), torch.nan, dtype=torch.float32)
+            filled = {f.key: nothing.unsqueeze(-1).expand(-1, -1, f.size) for f in columns if f.key not in batch}
+            parts = [_column({**batch, **filled}, feature, context_length) for feature in columns]
+        else:
+            parts = [_column(batch, feature, context_length) for feature in columns]
+        if name == "rtg":
+            parts.append(_timestep(batch, parts[0], fps) / horizon)
+        values[name] = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+    first = next(iter(values.values()))
+    pad = batch.get(f"{STATE}_is_pad", batch.get(f"{ACTION}_is_pad"))
+    valid = ~pad if pad is not None else torch.ones(first.shape[:2], dtype=torch.bool, device=first.device)
+    return Window(values, valid)
+
+
+def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:
+    """(B, K, size) float32."""
+    if feature.key not in batch:
+        raise KeyError(f"The batch lacks {feature.key!r}, which this model reads; it has {', '.join(sorted(batch))}.")
+    value = batch[feature.key]
+    shape = tuple(value.shape)
+    if value.ndim == 2 and feature.size == 1:
+        value = value.unsqueeze(-1)
+    if value.ndim != 3 or value.shape[1:] != (K, feature.size):
+        raise ValueError(
+            f"{feature.key} has shape {shape}; a window of this model is (batch, {K}, {feature.size}): "
+            f"{K} steps from the sampled frame on."
+        )
+    return value.to(torch.float32, copy=True)  # changing a window must not change the batch it was read from
+
+
+def _timestep(batch: Mapping[str, Tensor], like: Tensor, fps: Tensor) -> Tensor:
+    """Each step's number within its episode, (B, K, 1)."""
+    steps = torch.arange(like.shape[1], device=like.device, dtype=like.dtype).expand(like.shape[:2])
+    if "timestamp" in batch:
+        first = (batch["timestamp"].reshape(-1, 1).to(like) * fps).round()  # (B, 1)
+        steps = steps + first
+    return steps.unsqueeze(-1)
+
+
+class Statistics(nn.Module):
+    """Everything that the model knows about the dataset's units, as buffers: they are saved with the weights.
+
+    Discrete numbers and computed ones keep mean 0 and standard deviation 1, so that one rule serves every factor. Until
+    `fill` is called, nothing is scaled.
+    """
+
+    def __init__(self, features: Mapping[str, Sequence[Feature]], factors: Mapping[str, Factor], context_length: int):
+        super().__init__()
+        self.features = features
+        for name, factor in factors.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(factor.size))
+            self.register_buffer(f"{name}_std", torch.ones(factor.size))
+        self.register_buffer("horizon", torch.tensor(float(context_length)))  # steps of the longest episode
+        self.register_buffer("fps", torch.tensor(1.0))
+
+    def fill(self, dataset_stats: Mapping[str, Mapping[str, Any]]) -> None:
+        """Take over a dataset's statistics, as `LeRobotDatasetMetadata.stats` holds them.
+
+        Raises:
+            ValueError: a continuous feature has no mean and standard deviation there, or a discrete one more values
+                than categories.
+        """
+        for name, columns in self.features.items():
+            mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
+            start = 0
+            for feature in columns:
+                dims = slice(start, start + feature.size)
+                start += feature.size
+                known = {key: _numbers(value).to(mean) for key, value in dataset_stats.get(feature.key, {}).items()}
+                if feature.categories is None:
+                    if not {"mean", "std"} <= known.keys():
+                        raise ValueError(f"The dataset's statistics lack {feature.key!r}: recompute them with LeRobot.")
+                    constant = known["std"] <= 1e-6 * (1 + known["mean"].abs())  # is only shifted
+                    mean[dims], std[dims] = known["mean"], torch.where(constant, 1.0, known["std"])
+                elif "max" in known and (known["max"] >= torch.tensor(feature.categories).to(mean)).any():
+                    raise ValueError(
+                        f"{feature.key} reaches {known['max'].tolist()} in the dataset, whose info.json gives it the "
+                        f"categories {feature.categories}: numbers from 0 to one less."
+                    )
+        if "frame_index" in dataset_stats and "timestamp" in dataset_stats:
+            last = _numbers(dataset_stats["frame_index"]["max"])
+            self.horizon.fill_(last.item() + 1)
+            self.fps.fill_((last / _numbers(dataset_stats["timestamp"]["max"])).item() if last > 0 else 1.0)
+
+    def normalise(self, window: Window) -> Window:
+        values = {
+            name: (value - self.get_buffer(f"{name}_mean")) / self.get_buffer(f"{name}_std")
+            for name, value in window.values.items()
+        }
+        return Window(values, window.valid)
+
+    def denormalise(self, name: str, component: Component, output: Tensor) -> tuple[Tensor, Tensor | None]:
+        """A network's output for one continuous component, (..., size), as mean and scale in the dataset's units, each
+        (..., d); the scale is None where the head predicts none."""
+        mean, std = self.get_buffer(f"{name}_mean")[component.dims], self.get_buffer(f"{name}_std")[component.dims]
+        if not component.gaussian:
+            return output * std + mean, None
+        normalised_mean, log_scale = output.chunk(2, dim=-1)
+        return normalised_mean * std + mean, log_scale.clamp(*LOG_SCALE).exp() * std
+
+
+def _numbers(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float32).flatten()

@@ -1,0 +1,197 @@
+"""`unimask demo`: the main job from end to end, in a few minutes on two cores.
+
+It builds a DoorKey dataset, trains one policy with lerobot-train, mostly on random masks, evaluates it with
+lerobot-eval, asks it the questions of the paper's gridworld figures and draws the answers. Every number that it prints
+is in its JSON.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from dataset_builders.doorkey import build_doorkey
+from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.data.episodes import first_windows, open_dataset
+from lerobot_unimask.envs.doorkey.panels import five_panels, predicted_states
+from lerobot_unimask.envs.doorkey.pictures import draw_panels, state_distributions
+from lerobot_unimask.language.masks import TASKS
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.validation import task_losses
+
+EPISODES = 20_000
+
+UNSEEN_EPISODES = 500
+
+STEPS = 6000
+
+ROLLOUTS = 200
+
+# Random masks alone would do, with more updates: they hit the questions of acting rarely.
+MASKS = {"random_mask": 3, "goal_conditioned": 1, "reward_conditioned": 1}
+
+# What the console script does, without the page that LeRobot logs where FFmpeg, which only videos need, is missing.
+CONSOLE_SCRIPT = """
+import logging
+logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+from lerobot.scripts.{module} import main
+main()
+"""
+
+EXPERT = {"success_percent": 6.9, "mean_return": 3.04}
+
+
+def run_demo(output: Path, *, steps: int = STEPS) -> dict:
+    """Run all of it into `output` and return the record that it writes there as demo.json.
+
+    Raises:
+        FileExistsError: `output` exists and is not an empty folder; it is left as it was.
+        ChildProcessError: one of LeRobot's commands failed; it has printed why.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise FileExistsError(f"{output} exists and is not empty: give another folder, --output=DIR, or remove it.")
+    output.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+
+    _say(1, f"Building DoorKey: {EPISODES} training episodes of a noisy expert, {UNSEEN_EPISODES} to test on")
+    data = build_doorkey(output / "data", episodes=EPISODES, seed=0)
+    unseen = build_doorkey(output / "data_unseen", episodes=UNSEEN_EPISODES, seed=1)
+
+    _say(2, f"Training one policy, {steps} updates with LeRobot's own training loop: mostly random masks")
+    checkpoint = _train(output, data, steps)
+
+    _say(3, f"Evaluating it in the environment, {ROLLOUTS} episodes a question, with LeRobot's own evaluation loop")
+    rollouts = _evaluate(output, checkpoint)
+
+    _say(4, "Asking the policy questions, each one a mask, with the same weights")
+    policy = UniMASKPolicy.from_pretrained(checkpoint)
+    losses = task_losses(policy, first_windows(open_dataset(policy.config, unseen)), TASKS)
+    for task, loss in losses.items():
+        print(f"  {task:21} {TASKS[task]:34} loss {loss:.3f} nats on unseen episodes")
+    panels = five_panels(policy)
+    for panel in panels:
+        achieved = ", ".join(f"{name} {values}" for name, values in panel.achieved.items())
+        print(f"  {panel.name:16} {panel.question}  given {json.dumps(panel.given)}\n{'':19}{achieved}")
+    answer = predicted_states(policy)
+
+    _say(5, "Drawing the answers")
+    pictures = {
+        "five_panels.png": draw_panels(panels),
+        "state_distributions.png": state_distributions(answer),
+    }
+    for name, figure in pictures.items():
+        figure.savefig(output / name, dpi=200)
+        print(f"  {output / name}")
+
+    record = {
+        "seconds": round(time.monotonic() - began, 1),
+        "episodes": {"training": EPISODES, "unseen": UNSEEN_EPISODES},
+        "updates": steps,
+        "rollouts": rollouts,
+        "expert": EXPERT,
+        "loss_on_unseen_episodes": losses,
+        "panels": [dataclasses.asdict(panel) for panel in panels],
+        "state_distributions": _states(answer),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in ("torch", "lerobot", "lerobot_policy_unimask")},
+        },
+    }
+    (output / "demo.json").write_text(json.dumps(record, indent=2) + "\n")
+    _close(output, checkpoint, record["seconds"])
+    return record
+
+
+def _say(number: int, what: str) -> None:
+    print(f"\n[{number}/5] {what}", flush=True)
+
+
+def _train(output: Path, data: Path, steps: int) -> Path:
+    """The folder of the trained checkpoint."""
+    _run(
+        "lerobot-train",
+        "--policy.type=unimask",
+        "--policy.push_to_hub=false",
+        f"--policy.training_masks={json.dumps(MASKS)}",
+        "--policy.attention=bidirectional",  # the paper's network: half as many tokens, so twice the updates in time
+        "--policy.token_layout=stacked",
+        "--policy.depth=2",
+        "--policy.dropout=0",
+        "--dataset.repo_id=local/doorkey",
+        f"--dataset.root={data}",
+        f"--steps={steps}",
+        "--batch_size=100",
+        f"--save_freq={steps}",
+        f"--log_freq={max(steps // 6, 1)}",
+        "--env_eval_freq=0",
+        "--num_workers=0",
+        f"--output_dir={output / 'train'}",
+    )
+    return output / "train" / "checkpoints" / "last" / "pretrained_model"
+
+
+def _evaluate(output: Path, checkpoint: Path) -> dict[str, dict]:
+    """What lerobot-eval reports for the most likely actions and for sampled ones."""
+    questions = {
+        "imitation": [],
+        "imitation, sampled actions": ["--policy.sample_actions=true"],
+    }
+    rollouts = {}
+    for name, flags in questions.items():
+        folder = output / "eval" / name.replace(", ", "_").replace(" ", "_")
+        _run(
+            "lerobot-eval",
+            f"--policy.path={checkpoint}",
+            "--env.type=doorkey",
+            f"--eval.n_episodes={ROLLOUTS}",
+            "--eval.batch_size=100",
+            *flags,
+            f"--output_dir={folder}",
+        )
+        overall = json.loads((folder / "eval_info.json").read_text())["overall"]
+        rollouts[name] = {"success_percent": overall["pc_success"], "mean_return": overall["avg_sum_reward"]}
+    for name, result in rollouts.items():
+        print(f"  {name:27} success {result['success_percent']:5.1f} %, mean return {result['mean_return']:5.2f}")
+    print(
+        f"  (The expert itself: success {EXPERT['success_percent']} %, mean return {EXPERT['mean_return']}. "
+        "Its most likely actions are far better than its own.)"
+    )
+    return rollouts
+
+
+def _run(script: str, *arguments: str) -> None:
+    """One of LeRobot's console scripts, with its own output."""
+    print(f"$ {shlex.join([script, *arguments])}", flush=True)
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}  # everything is local
+    command = [sys.executable, "-c", CONSOLE_SCRIPT.format(module=script.replace("-", "_")), *arguments]
+    done = subprocess.run(command, env=environment)
+    if done.returncode != 0:
+        raise ChildProcessError(f"{script} failed, with status {done.returncode}; what it printed says why.")
+
+
+def _states(answer: Answer) -> dict:
+    """Each step's distribution of agent and key, and which steps were shown."""
+    return {
+        "shown": answer.mask.visible["s"][0].nonzero().flatten().tolist(),
+        **{part.name: torch.round(part.probabilities[0], decimals=4).tolist() for part in answer["s"]},
+    }
+
+
+def _close(output: Path, checkpoint: Path, seconds: float) -> None:
+    print(f"""
+Done in {seconds:.0f} s; everything is in {output}. Look at {output}/five_panels.png first. What to try next:
+
+  uv run lerobot-eval --policy.path={checkpoint} --env.type=doorkey --eval.n_episodes=100 --eval.batch_size=50 \\
+      --policy.inference_mask='a[t] | s[:t+1], a[:t], s[-1]' --policy.given='{{"s[-1]": [12, 12]}}'
+  uv run lerobot-train --policy.path={checkpoint} --policy.push_to_hub=false --policy.training_masks=behavior_cloning \\
+      --dataset.repo_id=local/doorkey --dataset.root={output}/data --steps=500 --num_workers=0
+  uv run unimask validate --run={output}/train --dataset.root={output}/data_unseen
+""")

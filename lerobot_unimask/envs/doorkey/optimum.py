@@ -1,0 +1,299 @@
+"""The exact optimum of DoorKey: what any model could answer at best, by dynamic programming over the true states.
+
+DoorKey and its expert are known and small: 77 reachable states (agent cell, key cell, door open or not) and four
+actions. So the posterior of every token given the shown ones is computed, for any mask, by the forward-backward
+algorithm (Rabiner, 1989) over a chain of which states are seen without the door, actions seen or not, and the return is
+known or not. `Optimum` takes the place of a policy's `predict`, so that losses, answers and pictures read it as they
+read a trained model; its loss is the lowest that a model can reach.
+
+A reward is by how much the distance to the goal shrank, so a window's return-to-go is the distance at its first step
+minus the distance after the episode's last action: given the return, the chain is solved once for each distance that
+the first state can have, and the last state's distance follows.
+
+Legend of shapes: B windows, K steps, S states, A actions, C distances of the first state.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_unimask.asking.answers import Answer, Predict
+from lerobot_unimask.asking.answers import answer as answer_question
+from lerobot_unimask.data.episodes import provenance_of
+from lerobot_unimask.data.factors import ACTION, RETURN_TO_GO, STATE, Feature, make_factors
+from lerobot_unimask.data.window import Statistics, Window
+from lerobot_unimask.envs.doorkey.expert import Expert, expert_probabilities
+from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, HORIZON, START_PAIRS, distance_to_goal, step
+from lerobot_unimask.language.masks import RANDOM_MASK, Mask
+from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
+from lerobot_unimask.networks.layers import Predictions
+
+FEATURES = {
+    "s": [Feature(STATE, 2, [len(CELLS), len(CELLS)], ["agent_cell", "key_cell"])],
+    "a": [Feature(ACTION, 1, [len(ACTIONS)], ["direction"])],
+    "rtg": [Feature(RETURN_TO_GO, 1, None, ["return_to_go"])],
+}
+
+SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # edges of the bins of how much a random mask hides
+
+FACTORS = make_factors(FEATURES)
+
+_CHUNK = 2048  # windows at a time: half a gigabyte
+
+_LOG_ZERO = -1000.0  # instead of minus infinity, which times zero is NaN; its exponential is exactly zero
+
+
+class Optimum:
+    """The exact posterior of every token given the shown ones: (window, mask) -> predictions, as `asking.Predict`.
+
+    Args:
+        expert: whose data it is, see `envs.doorkey.expert_progress`.
+        beta: the expert's rationality.
+        first_step: the episode's step at which the windows start. Known to the optimum, also where no return shows it.
+
+    Raises:
+        ValueError: an unknown expert, or a step that no episode has.
+    """
+
+    def __init__(self, expert: Expert = "paper", *, beta: float = 1.0, first_step: int = 0):
+        if not 0 <= first_step < HORIZON:
+            raise ValueError(f"first_step is {first_step}; an episode's steps are 0 to {HORIZON - 1}.")
+        states, following = _reachable_states()  # (S, 3), (S, A)
+        agent, key, door_open = states.T
+        self.first_step = first_step
+        self.following = torch.from_numpy(following)
+        self.policy = torch.from_numpy(
+            expert_probabilities(agent, key, door_open.astype(bool), expert=expert, beta=beta)
+        )  # (S, A)
+        self.seen = torch.from_numpy(states[:, :2])  # (S, 2): agent and key cell, of which the window tells
+        self.distance = torch.from_numpy(distance_to_goal(agent))  # (S,)
+        self.start = torch.zeros(len(states), dtype=torch.float64)  # (S,): of the window's first state
+        self.start[: len(START_PAIRS)] = 1 / len(START_PAIRS)
+        for _ in range(first_step):
+            self.start = self._advance(self.start[:, None] * self.policy)
+
+    def __call__(self, window: Window, mask: Mask, cache: None = None) -> Predictions:
+        """For every step logarithms of probabilities, float64, of the agent's cell, the key's cell and the action.
+
+        Args:
+            window: in the dataset's units, where a policy's `predict` takes normalised values.
+            mask: what is shown; each window is one question.
+            cache: not used: nothing need be remembered between questions.
+
+        Raises:
+            ValueError: what a window shows cannot occur together.
+        """
+        B, K = window.valid.shape
+        device = window.valid.device
+        values = {name: value.cpu() for name, value in window.values.items()}
+        visible = {name: shown.cpu() for name, shown in mask.visible.items()}
+        parts = []
+        for first in range(0, B, _CHUNK):
+            chunk = slice(first, first + _CHUNK)
+            these = ({name: tensor[chunk] for name, tensor in part.items()} for part in (values, visible))
+            parts.append(self._marginals(*these, K, first))
+        agent, key, action = (
+            torch.cat(part).log().clamp_min(_LOG_ZERO).to(device) for part in zip(*parts, strict=True)
+        )
+        return {"s": [agent, key], "a": [action]}
+
+    def _marginals(
+        self, values: dict[str, Tensor], visible: dict[str, Tensor], K: int, first_window: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Probabilities of the agent's cell (B, K, 16), the key's cell (B, K, 16) and the action (B, K, 4)."""
+        steps = HORIZON - self.first_step  # to the end of the episode; what follows the window is not seen
+        seen_state, seen_action = self._evidence(values, visible, K, steps)  # (B, T, S), (B, T, A)
+        first, last = self._return_evidence(values, visible)  # (1, C, S), (B, C, S)
+        B = len(last)
+
+        # Backward: ahead[k], (B, C, S), the probability of all that is seen from step k on, given the state there.
+        ahead = [last]
+        for k in reversed(range(steps)):
+            ahead.append(self._choices(ahead[-1], seen_action[:, k]).sum(-1) * seen_state[:, k, None])
+        ahead.reverse()
+
+        # Forward: past (B, C, S), the probability of all that is seen up to this step's state, and of the state.
+        agent, key = torch.full((2, B, K, len(CELLS)), 1 / len(CELLS), dtype=torch.float64)
+        action = torch.full((B, K, len(ACTIONS)), 1 / len(ACTIONS), dtype=torch.float64)  # past the episode's end
+        past = self.start * first * seen_state[:, 0, None]
+        for k in range(min(K, steps)):
+            joint = (past.unsqueeze(-1) * self._choices(ahead[k + 1], seen_action[:, k])).sum(1)  # (B, S, A)
+            total = joint.sum((1, 2))  # the probability of everything that is seen: the same at every step
+            if (total <= 0).any():
+                window = first_window + int((total <= 0).int().argmax())
+                raise ValueError(
+                    f"What window {window} shows cannot occur together in DoorKey, in an episode of this expert from "
+                    f"step {self.first_step} on: its probability is zero."
+                )
+            joint = joint / total[:, None, None]
+            state = joint.sum(-1)  # (B, S)
+            agent[:, k] = torch.zeros(B, len(CELLS), dtype=torch.float64).index_add_(1, self.seen[:, 0], state)
+            key[:, k] = torch.zeros(B, len(CELLS), dtype=torch.float64).index_add_(1, self.seen[:, 1], state)
+            action[:, k] = joint.sum(1)
+            if k + 1 < steps:
+                moves = past.unsqueeze(-1) * self.policy * seen_action[:, k, None, None]
+                past = self._advance(moves) * seen_state[:, k + 1, None]
+        return agent, key, action
+
+    def _evidence(
+        self, values: dict[str, Tensor], visible: dict[str, Tensor], K: int, steps: int
+    ) -> tuple[Tensor, Tensor]:
+        """Which states, (B, T, S), and actions, (B, T, A), agree with what is shown at each step of the episode."""
+        B = len(visible["s"])
+        state = torch.ones(B, steps, len(self.seen), dtype=torch.float64)
+        action = torch.ones(B, steps, len(ACTIONS), dtype=torch.float64)
+        within = min(K, steps)
+        agrees = (values["s"][:, :within, None] == self.seen).all(-1)  # (B, T, S)
+        state[:, :within] = (agrees | ~visible["s"][:, :within, None]).double()
+        agrees = values["a"][:, :within] == torch.arange(len(ACTIONS))  # (B, T, A)
+        action[:, :within] = (agrees | ~visible["a"][:, :within, None]).double()
+        return state, action
+
+    def _return_evidence(self, values: dict[str, Tensor], visible: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Which first states (1, C, S) belong to each case, and which last states (B, C, S) give the shown return."""
+        B, S = len(visible["s"]), len(self.seen)
+        shown = visible["rtg"][:, 0] if "rtg" in visible else torch.zeros(B, dtype=torch.bool)
+        if not shown.any():
+            return torch.ones(1, 1, S, dtype=torch.float64), torch.ones(B, 1, S, dtype=torch.float64)
+        returns, timestep = torch.where(shown[:, None], values["rtg"][:, 0], 0.0).unbind(-1)  # (B,)
+        if ((timestep * HORIZON - self.first_step).abs()[shown] > 1e-3).any():
+            raise ValueError(f"A shown return is not one at step {self.first_step}, where these windows start.")
+        distances = self.distance[self.start > 0].unique()  # (C,)
+        first = self.distance == distances[:, None]  # (C, S)
+        gives = distances[:, None] - self.distance == returns[:, None, None]  # (B, C, S)
+        return first[None].double(), (gives | ~shown[:, None, None]).double()
+
+    def _choices(self, ahead: Tensor, seen_action: Tensor) -> Tensor:
+        """(B, C, S) of the next step and (B, A) -> (B, C, S, A), action by action what comes of it."""
+        return self.policy * seen_action[:, None, None] * ahead[..., self.following]
+
+    def _advance(self, moves: Tensor) -> Tensor:
+        """Move the mass of each state and action, (..., S, A), to the states that follow, (..., S)."""
+        after = moves.new_zeros(moves.shape[:-1])
+        return after.index_add_(-1, self.following.flatten(), moves.flatten(-2))
+
+
+def check_features(features: Mapping[str, Sequence[Feature]]) -> None:
+    """The optimum can stand beside a model of DoorKey's states, actions and return alone.
+
+    Raises:
+        ValueError: the model's features are others.
+    """
+    if any(columns != FEATURES.get(name) for name, columns in features.items()):
+        raise ValueError(
+            "Only DoorKey's states, actions and return have an exact optimum; this model's features are "
+            f"{', '.join(feature.key for columns in features.values() for feature in columns)}."
+        )
+
+
+def exact_answer(window: Window, mask: Mask, *, expert: Expert = "paper", first_step: int = 0) -> Answer:
+    """What the optimum answers to one mask, in place of what a policy's `infer` does.
+
+    Args:
+        window: in the dataset's units; the return token (return-to-go, timestep / 10).
+        mask: over the same windows.
+        expert, first_step: see `Optimum`.
+
+    Raises:
+        ValueError: what a window shows cannot occur together.
+    """
+    units = Statistics(FEATURES, FACTORS, window.valid.shape[1])  # not filled, so that nothing is scaled
+    return answer_question(Optimum(expert, first_step=first_step), units, FACTORS, window, mask)
+
+
+def divergences(exact: Predictions, predictions: Predictions) -> dict[str, list[Tensor]]:
+    """Kullback-Leibler divergence from the exact marginal to the model's, for each component at every step.
+
+    Args:
+        exact, predictions: factor -> logits, one (B, K, categories) for each component.
+
+    Returns:
+        factor -> one (B, K) float64 for each component, in nats; 0 where the two agree.
+    """
+    return {
+        name: [_cross_entropy(p, q) - _cross_entropy(p, p) for p, q in zip(parts, predictions[name], strict=True)]
+        for name, parts in exact.items()
+    }
+
+
+def entropies(exact: Predictions) -> dict[str, list[Tensor]]:
+    """The loss that no model can beat in expectation, for each component at every step: (B, K) float64, in nats."""
+    return {name: [_cross_entropy(p, p) for p in parts] for name, parts in exact.items()}
+
+
+def mean_over_asked(costs: dict[str, list[Tensor]], predict: dict[str, Tensor]) -> float:
+    """Each component's mean over the asked-for tokens, added up: how `masked_losses` adds up its own costs."""
+    return sum(
+        cost[predict[name]].mean().item() for name, parts in costs.items() for cost in parts if predict[name].any()
+    )
+
+
+def random_mask_divergence(
+    optimum: Optimum, predict: Predict, window: Window, normalised: Window, index: Tensor, *, draws: int = 10
+) -> dict[str, dict[str, float]]:
+    """How far a model is from the optimum over many random masks: the mean divergence of the asked-for tokens, in nats.
+
+    Args:
+        window, normalised: the same windows in the dataset's units, for the optimum, and as the network reads them.
+        index: (B,) the windows' first frames, which decide the masks.
+        draws: masks of each window.
+
+    Returns:
+        Component (agent_cell, key_cell, direction) -> the share of states and actions that the mask hides, as
+        "0.2-0.4", or "all" -> mean over all asked-for tokens of such masks.
+    """
+    draw = TrainingMasks(RANDOM_MASK, tuple(window.values), window.valid.shape[1]).to(window.valid.device)
+    kinds = [(name, i, c.name) for name in ("s", "a") for i, c in enumerate(FACTORS[name].components)]
+    found: dict[str, list[Tensor]] = {label: [] for _, _, label in kinds}
+    shares: dict[str, list[Tensor]] = {label: [] for _, _, label in kinds}
+    for number in range(draws):
+        mask = draw(window.valid, index, seed=0, step=VALIDATION_STEP - number)
+        apart = divergences(optimum(window, mask), predict(normalised, mask, None))
+        hidden = torch.cat([mask.predict["s"], mask.predict["a"]], dim=1).double().mean(1)  # (B,)
+        for name, i, label in kinds:
+            found[label].append(apart[name][i][mask.predict[name]])
+            shares[label].append(hidden[:, None].expand_as(mask.predict[name])[mask.predict[name]])
+    return {label: _by_share(torch.cat(found[label]), torch.cat(shares[label])) for label in found}
+
+
+def _by_share(values: Tensor, share: Tensor) -> dict[str, float]:
+    """The means of values whose share lies in each of the bins of `SHARES`, and of all."""
+    bins = torch.bucketize(share, torch.tensor(SHARES[1:-1], dtype=share.dtype, device=share.device))
+    labels = [f"{low:g}-{high:g}" for low, high in itertools.pairwise(SHARES)]
+    means = {label: values[bins == i].mean().item() for i, label in enumerate(labels) if (bins == i).any()}
+    return {**means, "all": values.mean().item()}
+
+
+def _cross_entropy(target: Tensor, prediction: Tensor) -> Tensor:
+    """(..., categories) logits of both -> (...), in nats, float64."""
+    return -(target.double().softmax(-1) * prediction.double().log_softmax(-1)).sum(-1)
+
+
+def _reachable_states() -> tuple[np.ndarray, np.ndarray]:
+    """All states, (S, 3) int64 (agent, key, door open), the starts first, and where each action leads, (S, A)."""
+    states = [(int(agent), int(key), 0) for agent, key in START_PAIRS]
+    number = {state: i for i, state in enumerate(states)}
+    following = []
+    for agent, key, door_open in states:  # grows while it is read
+        reached = zip(*step(agent, key, np.array(bool(door_open)), np.arange(len(ACTIONS))), strict=True)
+        for state in ((int(a), int(k), int(d)) for a, k, d in reached):
+            if state not in number:
+                number[state] = len(states)
+                states.append(state)
+            following.append(number[state])
+    return np.array(states), np.array(following).reshape(len(states), len(ACTIONS))
+
+
+def check_expert(root: Path, exact: Expert | None) -> None:
+    """The optimum is that of the data's own expert.
+
+    Raises:
+        ValueError: the data are another's.
+    """
+    expert = provenance_of(root).get("expert", exact)
+    if exact is not None and expert != exact:
+        raise ValueError(f"{root} holds data of the expert {expert!r}: its optimum is not {exact!r}'s.")

@@ -1,0 +1,82 @@
+"""Maze2D: D4RL's point mass in a maze, on MuJoCo, with the velocity hidden (UniMASK, section 5.2).
+
+Rows of a maze's text lie along x, columns along y. All positions are joint positions, in cells: cell (row, column)
+is the position (row, column).
+
+Note: the mass's body stands at (1.2, 1.2) and the walls' boxes at (row + 1, column + 1), so the middle of a cell's
+free space is the joint position (row - 0.2, column - 0.2). That is D4RL's quirk, kept, and the drawing shows it.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from lerobot_unimask.envs.maze2d.maze import BODY_OFFSET, MASS_RADIUS, SUCCESS_DISTANCE, WALL_OFFSET, Cell, Maze
+
+PIXELS_PER_CELL = 48  # times any number of cells it is a multiple of 16, which suits video codecs
+
+SMOOTHING = 2  # drawn this many times larger and averaged down: smooth edges
+
+FLOOR_COLOUR, WALL_COLOUR, EDGE_COLOUR = (244, 242, 236), (62, 70, 86), (84, 94, 112)
+
+GOAL_COLOUR, GOAL_HALO = (46, 160, 103), (203, 231, 214)
+
+MASS_COLOUR, TRAIL_OLD, TRAIL_NEW = (222, 84, 62), (240, 214, 200), (232, 130, 104)
+
+
+def draw_maze(maze: Maze, goal: Cell, trail: Sequence[tuple[float, float]]) -> np.ndarray:
+    """Draw a maze from above as its text reads: x downwards, y to the right.
+
+    Args:
+        goal: its cell; the halo is the success distance.
+        trail: the mass's positions so far, the present one last.
+
+    Returns:
+        uint8 (48 rows, 48 columns, 3).
+    """
+    image = _draw_walls(maze).copy()
+    draw = ImageDraw.Draw(image)
+    _draw_disc(draw, goal, SUCCESS_DISTANCE, GOAL_HALO)
+    image.paste(_draw_walls(maze), mask=_wall_mask(maze))  # the halo lies under the walls
+    _draw_disc(draw, goal, 0.14, GOAL_COLOUR)
+    points = [_to_pixels(position) for position in trail]
+    for i in range(1, len(points)):
+        newness = i / len(points)
+        colour = tuple(round(old + newness * (new - old)) for old, new in zip(TRAIL_OLD, TRAIL_NEW, strict=True))
+        draw.line((*points[i - 1], *points[i]), fill=colour, width=3 * SMOOTHING)
+    _draw_disc(draw, trail[-1], MASS_RADIUS, MASS_COLOUR)
+    return np.asarray(image.reduce(SMOOTHING))
+
+
+def _to_pixels(position: tuple[float, float]) -> tuple[float, float]:
+    """A joint position (x, y) as (right, down) in the enlarged drawing, whose corner is the corner of cell (0, 0)."""
+    x, y = position
+    corner = BODY_OFFSET - WALL_OFFSET + 0.5
+    return (y + corner) * PIXELS_PER_CELL * SMOOTHING, (x + corner) * PIXELS_PER_CELL * SMOOTHING
+
+
+def _draw_disc(draw: ImageDraw.ImageDraw, position: tuple[float, float], radius: float, colour: tuple) -> None:
+    draw.circle(_to_pixels(position), radius * PIXELS_PER_CELL * SMOOTHING, fill=colour)
+
+
+@lru_cache(maxsize=32)
+def _wall_mask(maze: Maze) -> Image.Image:
+    walls = np.array([[cell == "#" for cell in row] for row in maze.rows])
+    size = PIXELS_PER_CELL * SMOOTHING
+    return Image.fromarray(walls.repeat(size, axis=0).repeat(size, axis=1))
+
+
+@lru_cache(maxsize=32)
+def _draw_walls(maze: Maze) -> Image.Image:
+    mask = _wall_mask(maze)
+    image = Image.new("RGB", mask.size, FLOOR_COLOUR)
+    image.paste(WALL_COLOUR, mask=mask)
+    draw = ImageDraw.Draw(image)
+    size = PIXELS_PER_CELL * SMOOTHING
+    for r, row in enumerate(maze.rows):
+        for c, cell in enumerate(row):
+            if cell == "#":
+                draw.rectangle((c * size, r * size, (c + 1) * size - 1, (r + 1) * size - 1), outline=EDGE_COLOUR)
+    return image

@@ -1,0 +1,288 @@
+"""The mask language, the table of named tasks, and the masks of a batch. `training_masks.py` draws them for training.
+
+A question is written in the paper's own notation, P(what is asked | what is shown), over a window of K steps:
+`a[t] | s[:t+1], a[:t]` is behaviour cloning. Here such a text becomes a boolean table with one row for each t that it
+admits; a mask for a batch is a choice of rows. A mask is boolean and True means: the model may see it.
+
+Legend of shapes: B windows, K steps, F factors, R rows (one for each admissible t of each task).
+"""
+
+import difflib
+import functools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.language.grammar import Index, MaskError, Question, Slice, Term, _check_text, _Parser
+
+# Paper, appendix "Training regimes". The names are the columns of the published heatmap. The waypoints are its steps
+# 0, K//3, 2K//3 and K-1 for K = 10; inverse dynamics is the paper's definition (recover the previous state).
+TASKS: dict[str, str] = {
+    "behavior_cloning": "a[t] | s[:t+1], a[:t]",
+    "reward_conditioned": "a[t] | s[:t+1], a[:t], rtg[0]",
+    "goal_conditioned": "a[t] | s[:t+1], a[:t], s[-1]",
+    "waypoint_conditioned": "a[t] | s[:t+1], a[:t], s[::3]",
+    "past": "s[:t], a[:t] | s[t:], a[t:]",
+    "future": "s[t+1:], a[t:] | s[:t+1], a[:t]",
+    "forward_dynamics": "s[t+1] | s[t], a[t]",
+    "inverse_dynamics": "s[t-1] | s[t], a[t-1]",
+}
+
+RANDOM_MASK = "random_mask"  # not a question: each window draws how much of it is hidden, and where
+
+REGIMES: dict[str, tuple[str, ...]] = {"multi_task": tuple(TASKS)}
+
+ASKABLE = ("s", "a")  # every other factor is a property: shown at step 0 or not at all, never asked
+
+
+def parse_token(text: str, factors: Sequence[str], context_length: int) -> tuple[str, int]:
+    """The factor and window position of a single token, such as `s[-1]`: ("s", K - 1).
+
+    Raises:
+        MaskError: it is not one token of this model's window.
+    """
+    _check_text(text)
+    parser = _Parser(text)
+    terms = parser.terms()
+    if parser.tokens[parser.next][0] != "end":
+        parser.fail("the end of the text")
+    steps = [step for term in terms for step in term.steps]
+    if len(steps) != 1 or not isinstance(steps[0], Index) or steps[0].relative:
+        raise MaskError("A value is given to a single token, such as s[-1] or rtg[0].", text, 0)
+    _check_factors(terms, factors, text)
+    chosen = _select(terms, factors, context_length, -1, text)
+    return terms[0].factor, int(chosen.any(0).int().argmax())
+
+
+def parse(text: str) -> Question:
+    """Parse one mask text or the name of a task in `TASKS`.
+
+    Raises:
+        MaskError: the text does not parse; shows it with a caret under the fault.
+    """
+    _check_text(text)
+    name = text.strip()
+    if re.fullmatch(r"\w+", name):
+        if name == RANDOM_MASK or name in REGIMES:
+            raise MaskError(f"{name} is a way of training, not a question: only training_masks can name it.", text)
+        if name not in TASKS:
+            near = difflib.get_close_matches(name, [*TASKS, RANDOM_MASK, *REGIMES], n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise MaskError(
+                f"No task is named {name!r}.{hint} Named tasks: {', '.join(TASKS)}. "
+                "Any other question is written out, as in 's[1:9] | s[0], s[3]'.",
+                text,
+                text.index(name),
+            )
+        text = TASKS[name]
+    return _Parser(text).question()
+
+
+@dataclass(frozen=True)
+class MaskTable:
+    """Every mask that one question stands for: row r is the mask at t = `t[r]`.
+
+    `visible` and `predict` are (R, F, K) booleans, `t` is (R,) int64; a question without t has one row, with t = -1.
+    """
+
+    question: Question
+    factors: tuple[str, ...]
+    visible: Tensor
+    predict: Tensor
+    t: Tensor
+
+    @functools.cached_property
+    def shows(self) -> dict[str, Tensor]:
+        """factor -> (K,) bool: tokens shown by some row."""
+        return dict(zip(self.factors, self.visible.any(0), strict=True))
+
+    @functools.cached_property
+    def shows_ahead(self) -> dict[str, Tensor]:
+        """factor -> (K,) bool: tokens shown by some row before a rollout at its t can have observed them."""
+        steps, t = torch.arange(self.visible.shape[-1]), self.t[:, None]
+        ahead = {"s": steps > t, "a": steps >= t}  # (R, K); a property is never observed
+        always = torch.ones_like(steps > t)
+        return {name: (self.visible[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
+
+    @functools.cached_property
+    def acts(self) -> bool:
+        """Whether there is a row for every step t of the window, and it asks for a[t]: a question for rollouts."""
+        steps = torch.arange(self.visible.shape[-1])
+        return torch.equal(self.t, steps) and bool(self.predict[steps, self.factors.index("a"), steps].all())
+
+    def masks(self) -> "Mask":
+        """Every row as one batch of masks."""
+        return Mask(
+            dict(zip(self.factors, self.visible.unbind(1), strict=True)),
+            dict(zip(self.factors, self.predict.unbind(1), strict=True)),
+        )
+
+    def at(self, t: int | None, batch_size: int = 1) -> "Mask":
+        """The mask at step t for each window of a batch.
+
+        Raises:
+            MaskError: the question has a t and none is given, or it does not admit this one.
+        """
+        if not self.question.uses_t:
+            if t is not None:
+                raise MaskError(f"t={t} is given, but the question is about no step t.", self.question.text, 0)
+            row = 0
+        elif t is None:
+            raise MaskError("The question is about a step t: say which, as in t=3.", self.question.text, 0)
+        elif int(t) not in self.t.tolist():
+            admitted = ", ".join(map(str, self.t.tolist()))
+            raise MaskError(
+                f"The question cannot be asked at t={int(t)}; it can at t = {admitted}.", self.question.text
+            )
+        else:
+            row = self.t.tolist().index(int(t))
+        shape = (batch_size, self.visible.shape[-1])
+        return Mask(
+            {name: self.visible[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
+            {name: self.predict[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
+        )
+
+
+@functools.lru_cache(maxsize=256)
+def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTable:
+    """Work out, for every t that `text` admits, which tokens of a window are shown and which are asked for.
+
+    Args:
+        text: a question or the name of a task.
+        factors: the model's factors, `s` and `a` first; the others are properties.
+        context_length: K.
+
+    Raises:
+        MaskError: unknown factor, a step outside the window, a property asked for or shown after step 0, nothing asked.
+    """
+    question = parse(text)
+    text = question.text
+    _check_factors(question.terms, factors, text)
+    for term in question.asked:
+        if term.factor not in ASKABLE:
+            raise MaskError(f"{term.factor} can be shown but never asked; ask for s or a.", text, term.position)
+    rows: list[tuple[int, Tensor, Tensor]] = []
+    for t in range(context_length) if question.uses_t else (-1,):
+        predict = _select(question.asked, factors, context_length, t, text)
+        visible = _select(question.shown, factors, context_length, t, text)
+        if predict is None or visible is None:
+            continue  # an integer index falls outside the window at this t
+        predict &= ~visible  # what is shown is not asked
+        if predict.any():
+            rows.append((t, visible, predict))
+    if not rows:
+        where = f" for any t in a window of {context_length} steps" if question.uses_t else ""
+        raise MaskError(f"Nothing is asked that is not shown{where}.", text, question.asked[0].position)
+    return MaskTable(
+        question,
+        tuple(factors),
+        visible=torch.stack([visible for _, visible, _ in rows]),
+        predict=torch.stack([predict for _, _, predict in rows]),
+        t=torch.tensor([t for t, _, _ in rows]),
+    )
+
+
+def _check_factors(terms: Sequence[Term], factors: Sequence[str], text: str) -> None:
+    for term in terms:
+        if term.factor not in factors:
+            near = difflib.get_close_matches(term.factor, factors, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            known = ", ".join(factors)
+            raise MaskError(
+                f"This model has no factor {term.factor!r}.{hint} Its factors are {known}.", text, term.position
+            )
+
+
+def _select(terms: Sequence[Term], factors: Sequence[str], K: int, t: int, text: str) -> Tensor | None:
+    """The tokens that `terms` name at this t, (F, K) bool; None where an integer rules this t out."""
+    chosen = torch.zeros(len(factors), K, dtype=torch.bool)
+    for term in terms:
+        for part in term.steps:
+            if isinstance(part, Slice):
+                bounds = slice(_bound(part.start, K, t), _bound(part.stop, K, t), part.step)
+                steps = range(*bounds.indices(K))
+            else:
+                step = part.value + t if part.relative else part.value
+                if part.relative and not 0 <= step < K:
+                    return None
+                if not -K <= step < K:
+                    raise MaskError(
+                        f"Step {step} lies outside the window: its steps are 0 to {K - 1} (or -{K} to -1).",
+                        text,
+                        part.position,
+                    )
+                steps = (step % K,)
+            if term.factor not in ASKABLE and any(steps):
+                raise MaskError(
+                    f"{term.factor} can be shown at step 0 only: write {term.factor}[0].", text, term.position
+                )
+            chosen[factors.index(term.factor), list(steps)] = True
+    return chosen
+
+
+def _bound(index: Index | None, K: int, t: int) -> int | None:
+    """A slice's bound. With t it is clipped to the window and never wraps; without, it is Python's."""
+    if index is None or not index.relative:
+        return index.value if index else None
+    return min(max(index.value + t, 0), K)
+
+
+@dataclass
+class Mask:
+    """Which tokens of a batch of windows the model may see and which it is asked for.
+
+    Two dicts of factor -> (B, K) bool; True in `visible` means shown, True in `predict` means asked. Goal-conditioned
+    imitation at t = 2 in a window of six steps, `#` shown, `?` asked, `.` neither:
+
+        s ###..#  a ##?...
+
+    `causal`, one bool or (B,), says which windows are read causally: each asked token sees only what is shown before it
+    in the order properties, s0, a0, s1, a1, ...; so one window may show a token to those after it and ask for it too.
+    """
+
+    visible: dict[str, Tensor]
+    predict: dict[str, Tensor]
+    causal: Tensor | bool = False
+
+    def within(self, valid: Tensor) -> "Mask":
+        """The same mask with steps outside the episode, `valid` (B, K) False, neither shown nor asked."""
+        visible = {name: shown & valid for name, shown in self.visible.items()}
+        predict = {name: asked & valid for name, asked in self.predict.items()}
+        return Mask(visible, predict, self.causal)
+
+    def repeat(self, times: int) -> "Mask":
+        """Each window's mask `times` times, one after another."""
+        visible = {name: shown.repeat_interleave(times, dim=0) for name, shown in self.visible.items()}
+        predict = {name: asked.repeat_interleave(times, dim=0) for name, asked in self.predict.items()}
+        causal = self.causal if isinstance(self.causal, bool) else self.causal.repeat_interleave(times, dim=0)
+        return Mask(visible, predict, causal)
+
+    def to(self, device: torch.device) -> "Mask":
+        return Mask(
+            {name: shown.to(device) for name, shown in self.visible.items()},
+            {name: asked.to(device) for name, asked in self.predict.items()},
+            self.causal if isinstance(self.causal, bool) else self.causal.to(device),
+        )
+
+    def next_tokens(self) -> dict[str, Tensor]:
+        """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and
+        action before it and none after; properties may be shown or not."""
+        shown, asked = (
+            torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1)
+            for tokens in (self.visible, self.predict)
+        )  # (B, 2 K), in the order of time
+        order = torch.arange(shown.shape[1], device=shown.device)
+        count = shown.sum(1, keepdim=True)
+        history = shown.any(1, keepdim=True) & (shown == (order < count)).all(1, keepdim=True)
+        return dict(zip(ASKABLE, (history & asked & (order == count)).unflatten(1, (-1, 2)).unbind(-1), strict=True))
+
+    def draw(self, window: int = 0) -> str:
+        """One window's mask as text, in the notation of the class's docstring."""
+        rows = []
+        for name, shown in self.visible.items():
+            marks = zip(shown[window].tolist(), self.predict[name][window].tolist(), strict=True)
+            rows.append(f"{name} " + "".join("#" if s else "?" if p else "." for s, p in marks))
+        return "  ".join(rows)

@@ -1,0 +1,228 @@
+"""The masks that training draws: a mixture of questions and of random masking, for whole batches without a loop.
+
+Legend of shapes: B windows, K steps, F factors, R rows (one for each admissible t of each task), T tasks.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK, REGIMES, TASKS, Mask, MaskTable, parse, tabulate
+
+# The update count of training masks is never negative, so validation draws masks that no update has seen, and at every
+# validation the same ones.
+VALIDATION_STEP = -1
+
+
+class TrainingMasks(nn.Module):
+    """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
+
+    A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
+    apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
+    cloning does. The causal form of random masking shows all states and actions, each property with probability 1/2,
+    and asks for every token but the first state.
+
+    Args:
+        masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
+            of a task, `random_mask`, or a regime's name (`multi_task`: the eight tasks, sharing its weight; without a
+            return factor, seven).
+        factors: the model's factors.
+        context_length: K.
+        causal_share: of the windows, or of the updates, that are causal.
+        causal_draw: `window`, each draws whether it is causal; `update`, all of an update's together.
+
+    Raises:
+        MaskError: a text that does not fit the model, or with a causal share of 1 has no causal form.
+        ValueError: no masks, or weights that are not positive numbers.
+    """
+
+    def __init__(
+        self,
+        masks: str | Sequence[str] | Mapping[str, float],
+        factors: Sequence[str],
+        context_length: int,
+        *,
+        causal_share: float = 0.0,
+        causal_draw: str = "window",
+    ):
+        super().__init__()
+        self.factors = tuple(factors)
+        self.weights = mixture(masks, self.factors)
+        tables = {text: tabulate(text, self.factors, context_length) for text in self.weights if text != RANDOM_MASK}
+        tasks = {text: task for task, text in enumerate(self.weights)}
+        self.random_task = tasks.get(RANDOM_MASK)
+        empty = torch.zeros(0, len(self.factors), context_length, dtype=torch.bool)
+        weights = torch.tensor(list(self.weights.values()), dtype=torch.float64)
+        # Worked out from the config, so not part of the checkpoint.
+        self._keep("visible", torch.cat([empty, *(table.visible for table in tables.values())]))
+        self._keep("predict", torch.cat([empty, *(table.predict for table in tables.values())]))
+        self._keep("task_of_row", torch.tensor([tasks[text] for text in tables for _ in tables[text].t]).long())
+        self._keep("askable", torch.tensor([name in ASKABLE for name in self.factors])[:, None])  # (F, 1)
+        self._keep("cumulative_weights", _cumulative(weights))
+        forms = [self._causal_form(tables.get(text), context_length) for text in self.weights]
+        capable = torch.tensor([form is not None for form in forms])
+        if causal_share == 1 and not capable.all():
+            text = list(self.weights)[forms.index(None)]
+            raise MaskError(
+                "A model that attends causally alone is trained on questions that ask for one token and show every "
+                "state and action before it, such as behavior_cloning, reward_conditioned or random_mask; this one "
+                "is not.",
+                TASKS.get(text, text),
+            )
+        self.causal_share = causal_share if capable.any() else 0.0
+        self.causal_draw = causal_draw
+        nothing = (empty.new_zeros(empty.shape[1:]),) * 2
+        visible, predict = zip(*(form or nothing for form in forms), strict=True)
+        self._keep("causal_visible", torch.stack(visible))  # (T, F, K) for each of the tasks
+        self._keep("causal_predict", torch.stack(predict))
+        self._keep("causal_row", capable[self.task_of_row])
+        self._keep("causal_cumulative_weights", _cumulative(weights * capable) if capable.any() else torch.zeros(0))
+
+    def _keep(self, name: str, tensor: Tensor) -> None:
+        self.register_buffer(name, tensor, persistent=False)
+
+    def _causal_form(self, table: MaskTable | None, K: int) -> tuple[Tensor, Tensor] | None:
+        """What a causal window of this task, None for random masking, shows and asks for: two (F, K), or None."""
+        if table is None:
+            visible = torch.ones(len(self.factors), K, dtype=torch.bool)
+            predict = self.askable.repeat(1, K)
+            predict[self.factors.index("s"), 0] = False  # nothing of the window comes before it
+            visible[[f for f, name in enumerate(self.factors) if name not in ASKABLE], 1:] = False
+            return visible, predict
+        mask = table.masks()
+        following = mask.next_tokens()
+        if any((following[name] != mask.predict[name]).any() for name in ASKABLE):
+            return None
+        return table.visible.any(0), table.predict.any(0)
+
+    def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
+        """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
+        causally. All else it answers in both directions."""
+        following = mask.next_tokens()
+        if self.causal_share > 0 and self.random_task is not None:
+            return following
+        learnt = self.causal_row & (self.causal_share > 0)  # (R,)
+        visible = torch.stack([mask.visible[name] for name in self.factors], dim=1)  # (B, F, K)
+        same = (visible[:, None] == self.visible).all((2, 3)) & learnt  # (B, R)
+        return {
+            name: tokens & (same.float() @ self.predict[:, self.factors.index(name)].float() > 0)
+            for name, tokens in following.items()
+        }
+
+    def forward(self, valid: Tensor, index: Tensor, *, seed: int, step: Tensor | int) -> Mask:
+        """Draw a mask for each window.
+
+        Args:
+            valid: (B, K) bool, False past the episode's end.
+            index: (B,) the windows' first frames. Together with `seed` and `step` it decides the mask, so that masks
+                do not depend on workers, on how a batch is split over processes, or on a restart.
+            step: how many updates have been made.
+        """
+        B, K = valid.shape
+        F = len(self.factors)
+        uniform = counter_uniform(seed, step, index, 4 + F * K)  # (B, 4 + F K)
+        task = torch.searchsorted(self.cumulative_weights, uniform[:, 0].contiguous(), right=True)  # (B,)
+        visible = valid.new_zeros(B, F, K)
+        predict = valid.new_zeros(B, F, K)
+        if len(self.visible):
+            visible, predict = self._question_masks(valid, task, uniform[:, 1])
+        hidden = self._hidden(uniform[:, 2], uniform[:, 3:-1].view(B, F, K))
+        if self.random_task is not None:
+            chosen = (task == self.random_task)[:, None, None]
+            visible = torch.where(chosen, ~hidden, visible)
+            predict = torch.where(chosen, hidden & self.askable, predict)
+        causal: Tensor | bool = False
+        if self.causal_share > 0:
+            causal = self._draw_causal(uniform[:, -1], seed, step)  # (B,)
+            task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
+            shown = self.causal_visible[task]
+            if self.random_task is not None:
+                shown = shown & (self.askable | ~hidden | (task != self.random_task)[:, None, None])
+            visible = torch.where(causal[:, None, None], shown, visible)
+            predict = torch.where(causal[:, None, None], self.causal_predict[task], predict)
+        visible, predict = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (visible, predict))
+        return Mask(visible, predict, causal).within(valid)
+
+    def _draw_causal(self, uniform: Tensor, seed: int, step: Tensor | int) -> Tensor:
+        """(B,) bool, which windows are causal."""
+        if self.causal_draw == "update":
+            one = torch.full((1,), -1, dtype=torch.int64, device=uniform.device)  # no frame's index
+            uniform = counter_uniform(seed, step, one, 1)[:, 0].expand_as(uniform)
+        return uniform < self.causal_share
+
+    def _question_masks(self, valid: Tensor, task: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """One row per window, uniform among those of its task that ask for something valid: two (B, F, K)."""
+        asked = self.predict.any(1)  # (R, K)
+        admissible = (valid.float() @ asked.T.float() > 0) & (self.task_of_row == task[:, None])  # (B, R)
+        rank = admissible.cumsum(1)
+        wanted = (uniform * rank[:, -1]).floor() + 1  # 1 .. number of admissible rows
+        row = (admissible & (rank == wanted[:, None])).int().argmax(1)  # (B,)
+        some = admissible.any(1)[:, None, None]
+        return self.visible[row] & some, self.predict[row] & some
+
+    def _hidden(self, probability: Tensor, uniform: Tensor) -> Tensor:
+        """Random masking (paper, section 2.2 and appendix C): p ~ U(0, 1) per window, each state and action hidden
+        with probability p; a property's first token hidden with probability 1/2, its later ones always. (B, F, K)."""
+        hidden = uniform < probability[:, None, None]
+        for f, name in enumerate(self.factors):
+            if name not in ASKABLE:
+                hidden[:, f, 0] = uniform[:, f, 0] < 0.5
+                hidden[:, f, 1:] = True
+        return hidden
+
+
+def _cumulative(weights: Tensor) -> Tensor:
+    """Where the unit interval is cut so that each task gets its share, for `searchsorted`: (T - 1,)."""
+    return (weights / weights.sum()).cumsum(0)[:-1].float()
+
+
+def mixture(masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[str] | None = None) -> dict[str, float]:
+    """`training_masks` as one mapping from texts to weights, regimes expanded.
+
+    Args:
+        factors: the model's; a regime is then made of the tasks that it has the factors for. None: not known yet.
+
+    Raises:
+        ValueError: nothing given, or weights that are not positive numbers.
+    """
+    if isinstance(masks, str):
+        masks = [masks]
+    weights = list(masks.items()) if isinstance(masks, Mapping) else [(text, 1.0) for text in masks]
+    if not weights:
+        raise ValueError(f"training_masks is empty; name a question or a task: {', '.join([*TASKS, RANDOM_MASK])}.")
+    expanded: dict[str, float] = {}
+    for text, weight in weights:
+        if not isinstance(weight, int | float) or not 0 < weight < float("inf"):
+            raise ValueError(f"training_masks gives {text!r} the weight {weight!r}; weights are positive numbers.")
+        members = REGIMES.get(text, (text,))
+        if text in REGIMES and factors is not None:
+            members = [member for member in members if {term.factor for term in parse(member).terms} <= set(factors)]
+        for member in members:
+            expanded[member] = expanded.get(member, 0.0) + weight / len(members)
+    return expanded
+
+
+def counter_uniform(seed: int, step: Tensor | int, index: Tensor, n: int) -> Tensor:
+    """n uniform numbers in [0, 1) for each of `index` (B,), a pure function of (seed, step, index): (B, n) float32.
+
+    SplitMix64's finaliser (Steele, Lea and Flood, 2014) as a counter-based hash.
+    """
+    golden = -0x61C8864680B583EB  # 2^64 / golden ratio, as a signed integer
+    index = index.to(torch.int64)
+    key = _mix64(_mix64(torch.full_like(index, seed) * golden) + step)
+    lanes = torch.arange(1, n + 1, device=index.device) * golden
+    bits = _mix64(_mix64(key ^ (index * golden))[:, None] + lanes)  # (B, n)
+    return _shift_right(bits, 40).float() * 2.0**-24
+
+
+def _mix64(x: Tensor) -> Tensor:
+    x = (x ^ _shift_right(x, 30)) * -0x40A7B892E31B1A47
+    x = (x ^ _shift_right(x, 27)) * -0x6B2FB644ECCEEE15
+    return x ^ _shift_right(x, 31)
+
+
+def _shift_right(x: Tensor, bits: int) -> Tensor:
+    """A logical shift: torch has signed 64-bit integers alone, whose shift copies the sign."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)

@@ -1,0 +1,152 @@
+"""What a policy's answers say: how near they come to recorded actions, how far ahead they see, whether both directions
+agree, how long they take.
+
+Legend of shapes: B windows, K steps, D the dimensions of a state.
+"""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.asking.answers import answer as answer_question
+from lerobot_unimask.data.episodes import bounds_of, open_dataset, read_windows
+from lerobot_unimask.data.factors import RETURN_SO_FAR, Component
+from lerobot_unimask.language.masks import Mask
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+EVERY = 7  # steps between the windows that are read
+
+
+def unseen_windows(policy: UniMASKPolicy, root: Path, episodes: Sequence[int]) -> dict[str, Tensor]:
+    """Full windows of some episodes, one every few steps, as one LeRobot batch.
+
+    Raises:
+        ValueError: no episode is as long as a window.
+    """
+    K = policy.config.context_length
+    dataset = open_dataset(policy.config, root)
+    bounds = bounds_of(dataset)
+    starts = [start for e in episodes for start in range(bounds[e][0], bounds[e][1] - K + 1, EVERY)]
+    if not starts:
+        raise ValueError(f"None of these episodes of {root} has the {K} steps of a window.")
+    return read_windows(dataset, starts)
+
+
+def error_ahead(policy: UniMASKPolicy, batch: dict[str, Tensor], ahead: int) -> dict[str, float]:
+    """How far the predicted state is from the true one `ahead` steps on, given all states and actions up to now; beside
+    it, how far one gets by repeating the last displacement as often.
+
+    Returns:
+        Mean Euclidean distances in the dataset's units, and the number of windows.
+
+    Raises:
+        ValueError: states that are not continuous, or a window that is too short.
+    """
+    if any(component.discrete for component in policy.factors["s"].components):
+        raise ValueError("The distance to the true state is measured where states are continuous.")
+    now = policy.config.context_length - 1 - ahead
+    if now < 1:
+        raise ValueError(f"{ahead} steps ahead needs a context_length of at least {ahead + 2}.")
+    answer = policy.infer(batch, f"s[{now + ahead}] | s[:{now + 1}], a[:{now}]")
+    states = policy.make_window(batch).values["s"]  # (B, K, D)
+    truth = states[:, now + ahead]
+    repeated = states[:, now] + ahead * (states[:, now] - states[:, now - 1])
+    return {
+        "steps": ahead,
+        "model": (answer.most_likely("s")[:, now + ahead] - truth).norm(dim=-1).mean().item(),
+        "last_displacement_repeated": (repeated - truth).norm(dim=-1).mean().item(),
+        "windows": len(truth),
+    }
+
+
+@torch.no_grad()
+def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str) -> float:
+    """The mean squared error of the predicted action, in standard deviations of the data, over all windows, steps t and
+    dimensions: what a rollout's returns follow, and far less noisy than they are."""
+    policy.eval()
+    recorded = policy.make_window(batch)
+    actions = recorded.values["a"]  # (B, K, D)
+    table = policy._table(question)
+    errors = []
+    for t in table.t.tolist():
+        mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
+        answer = answer_question(policy.predict, policy.statistics, policy.factors, recorded, mask)
+        error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.a_std
+        errors.append(error[mask.predict["a"][:, t]].square().flatten())
+    return torch.cat(errors).mean().item()
+
+
+@torch.no_grad()
+def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str) -> float:
+    """The mean Kullback-Leibler divergence, in nats, from the causal answer about an action to that in both directions,
+    over all windows and steps t, components added up. An L2 head counts as a Gaussian of the data's scale."""
+    policy.eval()
+    window = policy.statistics.normalise(policy.make_window(batch))
+    table = policy._table(question)
+    found = []
+    for t in table.t.tolist():
+        mask: Mask = table.at(t, len(window.valid)).to(policy.device).within(window.valid)
+        causal, both = (policy.network(window, mask.visible, direction)["a"] for direction in (True, False))
+        components = policy.factors["a"].components
+        parts = [
+            _divergence(p[:, t], q[:, t], component) for p, q, component in zip(causal, both, components, strict=True)
+        ]
+        found.append(sum(parts)[mask.predict["a"][:, t]])
+    return torch.cat(found).mean().item()
+
+
+def _divergence(p: Tensor, q: Tensor, component: Component) -> Tensor:
+    """(B, size) of two networks' outputs -> (B,)"""
+    if component.discrete:
+        p, q = p.log_softmax(-1), q.log_softmax(-1)
+        return (p.exp() * (p - q)).sum(-1)
+    if not component.gaussian:
+        return (p - q).square().sum(-1) / 2
+    (mean_p, scale_p), (mean_q, scale_q) = p.chunk(2, dim=-1), q.chunk(2, dim=-1)
+    apart = (2 * (scale_p - scale_q)).exp() + ((mean_p - mean_q) * (-scale_q).exp()).square()
+    return (scale_q - scale_p + apart / 2 - 0.5).sum(-1)
+
+
+def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> dict[str, float]:
+    """Milliseconds of `select_action` once the window slides, with the policy's own inference mask: median and
+    quartiles over the calls."""
+    policy.reset()
+    mean = policy.statistics.s_mean
+    times = []
+    for call in range(calls + policy.config.context_length):
+        state = mean.expand(environments, -1).clone()
+        batch: dict[str, Any] = {RETURN_SO_FAR: torch.zeros(environments, 1)}
+        start = 0
+        for feature in policy.config.features["s"]:
+            batch[feature.key] = (
+                state[:, start : start + feature.size].round()
+                if feature.categories
+                else (state[:, start : start + feature.size])
+            )
+            start += feature.size
+        began = time.perf_counter()
+        policy.select_action(batch)
+        if call >= policy.config.context_length:
+            times.append(1000 * (time.perf_counter() - began))
+    policy.reset()
+    low, median, high = torch.tensor(times).quantile(torch.tensor([0.25, 0.5, 0.75])).tolist()
+    return {"median_ms": median, "quartiles_ms": [low, high], "environments": environments}
+
+
+def measure(policy: UniMASKPolicy, root: Path, episodes: Sequence[int], *, ahead: int) -> dict[str, Any]:
+    """A JSON record of all that applies to this policy, over windows of episodes that it was not trained on."""
+    batch = unseen_windows(policy, root, episodes)
+    record: dict[str, Any] = {"windows": len(batch["index"]), "episodes": len(episodes)}
+    questions = ["behavior_cloning"] + ["reward_conditioned"] * ("rtg" in policy.factors)
+    if not any(component.discrete for component in policy.factors["a"].components):
+        record["action_error"] = {question: action_error(policy, batch, question) for question in questions}
+    continuous = not any(component.discrete for component in policy.factors["s"].components)
+    if continuous and policy.config.attention != "causal" and policy.config.context_length >= ahead + 2:
+        record["ahead"] = error_ahead(policy, batch, ahead)
+    if policy.config.attention == "both":
+        record["disagreement_nats"] = {question: disagreement(policy, batch, question) for question in questions}
+    return record

@@ -1,0 +1,217 @@
+"""A transformer over the tokens of a window that attends in both directions, as the paper's does (section 2.2, appendix
+D), or causally, with the same weights.
+
+In both directions, a hidden token's output predicts that token. Causally, a token's output predicts the next one, given
+it and those before it, so that one pass answers for every step of a window.
+
+Legend of shapes: B windows, K steps, F factors, N tokens, D the dimensions of a factor, W width, H heads.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.language.masks import ASKABLE
+
+Predictions = dict[str, list[Tensor]]  # factor -> one (B, K, size) for each of its components
+
+
+class NumberEncoding(nn.Module):
+    """Continuous values, normalised, as inputs that a network can resolve.
+
+    A point mass moves by a fiftieth of its positions' standard deviation in a step, and its velocity is there only as
+    that difference. So each number comes with its displacement per step since the previous shown step, at several
+    scales because no dataset's statistics tell its size, and with sines and cosines. A displacement exists only where
+    both ends are shown, and looks only backwards in time.
+
+    Args:
+        size: numbers of one token.
+        fine: False leaves the numbers alone, as the paper has them.
+    """
+
+    def __init__(self, size: int, *, fine: bool):
+        super().__init__()
+        self.fine = fine
+        # Wavelengths of 4, 2, 1 and 1/2 standard deviations
+        self.register_buffer("frequencies", torch.pi / 2 * 2.0 ** torch.arange(4), persistent=False)
+        self.register_buffer("scales", 4.0 ** torch.arange(4), persistent=False)
+        self.size = size * (1 + 2 * 4 + 4) + 1 if fine else size
+
+    def forward(self, value: Tensor, visible: Tensor) -> Tensor:
+        """(B, K, d), 0 where hidden, and (B, K) -> (B, K, size)"""
+        if not self.fine:
+            return value
+        previous = _previous_shown(visible)
+        both = (visible & (previous >= 0)).unsqueeze(-1)
+        gap = torch.arange(value.shape[1], device=value.device) - previous
+        displacement = torch.where(both, (value - _at(value, previous)) / gap.unsqueeze(-1), 0.0)
+        scaled = torch.tanh(displacement.unsqueeze(-1) * self.scales).flatten(2)
+        angles = (value.unsqueeze(-1) * self.frequencies).flatten(2)
+        return torch.cat([value, angles.sin(), angles.cos(), scaled, both.to(value.dtype)], dim=-1)
+
+
+def course(value: Tensor, visible: Tensor, causal: Tensor | bool) -> Tensor:
+    """Where values would be on the straight course through those shown nearest: between one before and one after, on
+    from the last two before, or back from the first two after; 0 where nothing is shown.
+
+    Predicted as departures from it, states some steps ahead are exact from the start to within what bends the course,
+    which in a squared error over whole windows would weigh too little to be learnt.
+
+    Args:
+        value: (B, K, d), 0 where hidden.
+        visible: (B, K)
+        causal: for all or each window, (B,): only what is before counts.
+
+    Returns:
+        (B, K, d)
+    """
+    steps = torch.arange(value.shape[1], device=value.device)
+    before = _previous_shown(visible)
+    onwards = _extrapolate(value, before)
+    if causal is True:
+        return onwards
+    after = value.shape[1] - 1 - _previous_shown(visible.flip(1)).flip(1)  # K: nothing after
+    backwards = _extrapolate(value.flip(1), _previous_shown(visible.flip(1))).flip(1)
+    share = ((steps - before) / (after - before)).unsqueeze(-1)
+    between = torch.lerp(_at(value, before), _at(value, after), share)
+    any_before, any_after = (before >= 0).unsqueeze(-1), (after < len(steps)).unsqueeze(-1)
+    both_ways = torch.where(any_before & any_after, between, torch.where(any_before, onwards, backwards))
+    return both_ways if causal is False else torch.where(causal[:, None, None], onwards, both_ways)
+
+
+def _previous_shown(visible: Tensor) -> Tensor:
+    """(B, K) -> (B, K): the last shown step before each, -1 where there is none."""
+    steps = torch.arange(visible.shape[1], device=visible.device)
+    return functional.pad(torch.where(visible, steps, -1).cummax(1).values, (1, -1), value=-1)
+
+
+def _at(value: Tensor, step: Tensor) -> Tensor:
+    """Values (B, K, d) at the steps (B, K); any where there is no such step."""
+    return value.gather(1, step.clamp(0, value.shape[1] - 1).unsqueeze(-1).expand_as(value))
+
+
+def _extrapolate(value: Tensor, last: Tensor) -> Tensor:
+    """On from the last shown step before each, (B, K), with the slope since the one before that, if there is one."""
+    steps = torch.arange(value.shape[1], device=value.device)
+    before_last = torch.where(last >= 0, last.gather(1, last.clamp_min(0)), -1)
+    start, earlier = _at(value, last), _at(value, before_last)
+    slope = (start - earlier) / (last - before_last).clamp_min(1).unsqueeze(-1)
+    slope = torch.where((before_last >= 0).unsqueeze(-1), slope, 0.0)
+    return torch.where((last >= 0).unsqueeze(-1), start + slope * (steps - last).unsqueeze(-1), 0.0)
+
+
+class FactorEmbedding(nn.Module):
+    """One factor's tokens. Hidden is learned, not zero: zero is a legal action and a legal position."""
+
+    def __init__(self, factor: Factor, width: int, *, fine_inputs: bool):
+        super().__init__()
+        self.discrete = {c.dims.start: c.categories for c in factor.components if c.discrete}
+        self.continuous = [c.dims for c in factor.components if not c.discrete]
+        self.categories = nn.ModuleList(nn.Embedding(count, width) for count in self.discrete.values())
+        if self.continuous:
+            self.encoding = NumberEncoding(sum(d.stop - d.start for d in self.continuous), fine=fine_inputs)
+            self.numbers = nn.Linear(self.encoding.size, width)
+        # Small, or in a stacked token what is hidden would drown what is shown, and learning takes twice as long.
+        self.hidden = nn.Parameter(0.02 * torch.randn(width))
+
+    def forward(self, value: Tensor, visible: Tensor) -> Tensor:
+        """(B, K, D) and (B, K) -> (B, K, W)"""
+        shown = visible.unsqueeze(-1)
+        # Replaced before it is embedded, so that not even a NaN in a hidden place can reach the network.
+        value = torch.where(shown, value, 0.0)
+        parts = [table(value[..., i].long()) for i, table in zip(self.discrete, self.categories, strict=True)]
+        if self.continuous:
+            numbers = torch.cat([value[..., dims] for dims in self.continuous], dim=-1)
+            parts.append(self.numbers(self.encoding(numbers, visible)))
+        return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
+
+
+class Heads(nn.ModuleDict):
+    """A linear layer for each predicted factor. Answers are in full precision also under mixed precision.
+
+    Args:
+        width: of what they read.
+        steps: of the window, that one input of theirs speaks for.
+    """
+
+    def __init__(self, factors: dict[str, Factor], width: int, *, steps: int = 1):
+        sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
+        super().__init__({name: nn.Linear(width, steps * sum(of_factor)) for name, of_factor in sizes.items()})
+        self.sizes = sizes
+        self.steps = steps
+
+    def forward(self, x: dict[str, Tensor]) -> Predictions:
+        """factor -> (B, K / steps, W)"""
+        with torch.autocast(x["s"].device.type, enabled=False):
+            outputs = {name: head(x[name].float()) for name, head in self.items()}
+        return {
+            name: list(output.unflatten(-1, (self.steps, -1)).flatten(1, 2).split(self.sizes[name], dim=-1))
+            for name, output in outputs.items()
+        }
+
+
+@dataclass
+class Cache:
+    """What causal attention has computed for a window's first n tokens: their inputs, (B, n, W), and each block's keys
+    and values, (B, H, n, W/H)."""
+
+    inputs: Tensor | None = None
+    keys: list[Tensor] = field(default_factory=list)
+    values: list[Tensor] = field(default_factory=list)
+
+    def matches(self, x: Tensor) -> bool:
+        """Whether (B, N, W) begins with the tokens that are kept; nothing else could be answered from them."""
+        return self.inputs is not None and torch.equal(x[:, : self.inputs.shape[1]], self.inputs)
+
+
+class Block(nn.Module):
+    """Self-attention, then a feed-forward network, each behind a layer norm."""
+
+    def __init__(self, width: int, heads: int, feedforward_width: int, dropout: float):
+        super().__init__()
+        self.heads = heads
+        self.dropout = dropout
+        self.norm_attention = nn.LayerNorm(width)
+        self.query_key_value = nn.Linear(width, 3 * width)
+        self.project = nn.Linear(width, width)
+        self.norm_feedforward = nn.LayerNorm(width)
+        self.feedforward = nn.Sequential(
+            nn.Linear(width, feedforward_width), nn.GELU(), nn.Linear(feedforward_width, width), nn.Dropout(dropout)
+        )
+
+    def forward(
+        self, x: Tensor, attend: Tensor | None, past: tuple[Tensor, Tensor] | None, *, last_alone: bool = False
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """
+        Args:
+            x: (B, n, W), the last n of N tokens.
+            attend: which of the N tokens each of the n sees, True = seen; None: all.
+            past: keys and values of the tokens before them, (B, H, N - n, W/H).
+            last_alone: nobody reads what comes out for the others, so it is not computed.
+
+        Returns:
+            (B, n, W), or (B, 1, W), and the keys and values of all N tokens.
+        """
+        B, n, W = x.shape
+        qkv = self.query_key_value(self.norm_attention(x)).view(B, n, 3, self.heads, W // self.heads)
+        if x.device.type == "cpu":
+            qkv = qkv.float()  # mixed precision: here the backward pass in bfloat16 takes ten times as long
+        query, key, value = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, n, W/H)
+        if past is not None:
+            key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
+        if last_alone:
+            x, query, attend = x[:, -1:], query[:, :, -1:], None if attend is None else attend[-1:]
+        dropout = self.dropout if self.training else 0.0
+        with torch.autocast("cpu", enabled=False):
+            attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=attend, dropout_p=dropout)
+        attended = self.project(attended.transpose(1, 2).flatten(2))
+        x = x + functional.dropout(attended, self.dropout, self.training)
+        return x + self.feedforward(self.norm_feedforward(x)), (key, value)
+
+
+def _before_or_here(tokens: int, device: torch.device) -> Tensor:
+    """(N, N) bool: row i sees column j, j <= i."""
+    return torch.ones(tokens, tokens, dtype=torch.bool, device=device).tril()

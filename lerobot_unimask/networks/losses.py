@@ -1,0 +1,76 @@
+"""What a prediction costs, over the asked-for tokens alone.
+
+Legend of shapes: B windows, K steps, D the dimensions of a factor.
+"""
+
+import math
+
+import torch
+from torch import Tensor, distributed
+from torch.nn import functional
+
+from lerobot_unimask.data.factors import LOG_SCALE, Component, Factor
+from lerobot_unimask.data.window import Window
+
+
+def component_loss(prediction: Tensor, value: Tensor, component: Component) -> Tensor:
+    """What one component costs at every step, (B, K): cross-entropy in nats; or, averaged over its dimensions and in
+    units of their standard deviations, the squared error or a Gaussian's negative log-likelihood in nats.
+
+    Note: A Gaussian's gradient is that of the negative log-likelihood times the predicted scale (Seitzer et al., "On
+        the pitfalls of heteroscedastic uncertainty estimation", 2022, beta = 1/2). Without it, what is predicted to
+        within a fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model that learns
+        where the mass goes is slow to learn what moves it (docs/experiments.md).
+    """
+    target = value[..., component.dims]
+    if component.discrete:
+        return functional.cross_entropy(prediction.transpose(1, 2), target.squeeze(-1).long(), reduction="none")
+    if component.gaussian:
+        mean, log_scale = prediction.chunk(2, dim=-1)
+        log_scale = log_scale.clamp(*LOG_SCALE)
+        surprise = (target - mean) * (-log_scale).exp()
+        cost = surprise.square() / 2 + log_scale + math.log(2 * math.pi) / 2
+        value = cost.detach()
+        return (value + log_scale.detach().exp() * (cost - value)).mean(-1)
+    return (prediction - target).square().mean(-1)
+
+
+def token_count(asked: Tensor) -> Tensor:
+    """The asked-for tokens of a batch, at least 1; of several processes' batches, on average over the processes.
+
+    Several processes train with the average of their gradients and log the average of their losses. Divided by this
+    count, a process's sum over tokens averages to the mean over all their tokens, as one process would have it that had
+    all their windows in one batch. A collective call: every process of the group computes its loss, or none.
+    """
+    count = asked.sum()
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return count.clamp_min(1)
+    distributed.all_reduce(count)
+    return count.clamp_min(1) / distributed.get_world_size()
+
+
+def masked_losses(
+    predictions: dict[str, list[Tensor]], window: Window, predict: dict[str, Tensor], factors: dict[str, Factor]
+) -> dict[str, Tensor]:
+    """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up. With several
+    processes it is this process's part in the mean over all their tokens, see `token_count`.
+
+    Args:
+        predictions: factor -> one (B, K, size) per component, as a network puts them out.
+        window: the recorded values, normalised.
+        predict: factor -> (B, K) bool, True = asked for; never a step outside the episode.
+
+    Returns:
+        factor -> scalar; 0 where nothing of the factor is asked.
+    """
+    losses = {}
+    for name, outputs in predictions.items():
+        asked = predict[name]
+        # Replaced where not asked: past the end of an episode anything may stand, even no number at all.
+        value = torch.where(asked.unsqueeze(-1), window.values[name], 0.0)
+        count = token_count(asked)
+        losses[name] = sum(
+            (component_loss(output, value, component) * asked).sum() / count
+            for output, component in zip(outputs, factors[name].components, strict=True)
+        )
+    return losses

@@ -1,0 +1,168 @@
+"""What earns its place: the same model with one thing changed at a time, at equal updates, on Maze2D.
+
+A variant is a set of policy settings. Every run trains one model, rolls it out with both questions, and measures how
+well it predicts unseen actions, how far ahead it sees, whether its directions agree, and what it costs.
+"""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask.measures import latency, measure
+from lerobot_unimask.paper.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
+from lerobot_unimask.paper.table import QUESTIONS, maze_returns, mean_return
+from lerobot_unimask.plots.curves import cost_of_context
+from lerobot_unimask.training import Trainer
+
+
+@dataclass
+class AblationConfig(VariantsConfig):
+    """A grid of runs, as its YAML file gives it."""
+
+    name: str = "ablation"
+    zero_hidden: str | None = None
+    # The variant in which hidden tokens are embedded as zeros, which is no setting of the policy.
+    context_lengths: list[int] = field(default_factory=lambda: [10])
+    steps: int = 2000
+    episodes: int = 1000
+    training_episodes: int = 900
+    measured_episodes: int | None = None
+    # How many of those that are not trained on are measured, the first ones; None: all.
+    rollouts: int = 200
+    ahead: int = 5
+    # Steps that the model is asked to see ahead.
+    data: str = "data/maze2d"
+    output: str = "outputs/ablation"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.training_episodes >= self.episodes:
+            raise ValueError(f"training_episodes is {self.training_episodes}; it must be less than {self.episodes}.")
+        if self.zero_hidden not in (None, *self.variants):
+            raise ValueError(f"zero_hidden is {self.zero_hidden!r}; the variants are {', '.join(self.variants)}.")
+
+
+def ablation(config: AblationConfig, **study: Any) -> dict[str, Any]:
+    """Do what is left of the grid; write `NAME.json` and `NAME.md`, and of several context lengths `NAME.png`.
+
+    Args:
+        study: storage and workers, as `run_study` takes them.
+
+    Returns:
+        The record that the JSON holds.
+    """
+    root = Path(config.data)
+    if not (root / "meta" / "info.json").exists():
+        build_maze2d(root, episodes=config.episodes, seed=0, progress=False)
+    runs = [
+        {"row": variant, "context_length": K, "seed": seed}
+        for seed in config.seeds
+        for K in config.context_lengths
+        for variant in config.variants
+    ]
+    output = Path(config.output)
+    records = run_study(config.name, runs, partial(execute, config), output=output, settings=config.settings(), **study)
+    record = {
+        "what": "return of LeRobot's evaluation, most likely actions; error of the predicted state some steps ahead",
+        "config": asdict(config),
+        "summary": summary(records),
+        "runs": records,
+    }
+    write_results(output, config.name, record, markdown(record))
+    if len(config.context_lengths) > 1:
+        cost_of_context(record).savefig(output / f"{config.name}.png", dpi=200)
+    return record
+
+
+def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
+    """One run: train, save, roll out, measure."""
+    settings = {**config.policy, "push_to_hub": False, "context_length": run["context_length"]}
+    settings |= config.variants[run["row"]]
+    root = Path(config.data)
+    trainer = Trainer(
+        settings,
+        root,
+        seed=run["seed"],
+        steps=config.steps,
+        batch_size=config.batch_size,
+        episodes=list(range(config.training_episodes)),
+    )
+    if run["row"] == config.zero_hidden:
+        for embedding in trainer.policy.network.embeddings.values():
+            embedding.hidden.requires_grad_(False).zero_()
+    began = time.process_time()
+    losses = list(trainer)
+    seconds = time.process_time() - began
+    policy = trainer.policy.eval()
+    saved = Path(config.output) / "checkpoints" / key(run)
+    policy.save_pretrained(saved)
+    unseen = range(config.training_episodes, config.episodes)
+    return {
+        "loss": sum(losses[-100:]) / len(losses[-100:]),
+        "returns": {question: maze_returns(saved, question, config.rollouts) for question in QUESTIONS.values()},
+        **trainer.record(),
+        "zero_hidden": run["row"] == config.zero_hidden,
+        "processor_seconds_per_update": seconds / config.steps,
+        "latency": latency(policy),
+        **measure(policy, root, unseen[: config.measured_episodes], ahead=config.ahead),
+    }
+
+
+def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Variant, with its context length -> quantity -> mean over seeds and standard error (of one seed: over rollouts,
+    where it is a return)."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for record in records:
+        found.setdefault(f"{record['row']}, K = {record['context_length']}", []).append(record)
+    return {row: _quantities(of_seeds) for row, of_seeds in found.items()}
+
+
+def _quantities(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    quantities = {
+        question: mean_return([record["returns"][question] for record in records]) for question in records[0]["returns"]
+    }
+    for question in records[0].get("action_error", ()):
+        quantities[f"{question}_error"] = mean_over_seeds([record["action_error"][question] for record in records])
+    if "ahead" in records[0]:
+        quantities["error_ahead"] = mean_over_seeds([record["ahead"]["model"] for record in records])
+    seconds = [record["processor_seconds_per_update"] for record in records]
+    quantities["ms_per_update"] = mean_over_seeds([1000 * value for value in seconds])
+    quantities["latency_ms"] = mean_over_seeds([record["latency"]["median_ms"] for record in records])
+    return quantities
+
+
+def markdown(record: Mapping[str, Any]) -> str:
+    """The summary as a table."""
+    config = record["config"]
+    columns = {
+        "behavior_cloning": "imitation",
+        "reward_conditioned": "reward-conditioned",
+        "behavior_cloning_error": "error of the imitated action",
+        "reward_conditioned_error": "of the reward-conditioned one",
+        "error_ahead": f"error {config['ahead']} steps ahead",
+        "ms_per_update": "ms of processor per update",
+        "latency_ms": "ms per action",
+    }
+    digits = dict.fromkeys(columns, 2) | {"error_ahead": 4, "ms_per_update": 0, "latency_ms": 1}
+    digits |= {"behavior_cloning_error": 3, "reward_conditioned_error": 3}
+    lines = [
+        f"{config['steps']} updates of {config['batch_size']} windows, {len(config['seeds'])} seed(s), "
+        f"{config['rollouts']} rollouts each, ± standard error over seeds (of one seed, over rollouts).\n",
+        "| variant | " + " | ".join(columns.values()) + " |",
+        "| --- " * (1 + len(columns)) + "|",
+    ]
+    for row, cells in record["summary"].items():
+        texts = [_text(cells.get(name), digits[name]) for name in columns]
+        lines.append(f"| {row} | " + " | ".join(texts) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _text(cell: Mapping[str, float] | None, digits: int) -> str:
+    if cell is None:
+        return ""
+    error = f" ± {cell['standard_error']:.{digits}f}" if cell["standard_error"] else ""
+    return f"{cell['mean']:.{digits}f}{error}"

@@ -1,0 +1,58 @@
+"""Return against updates: every checkpoint of a run, rolled out with LeRobot's own evaluation."""
+
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lerobot_unimask.data.checkpoints import checkpoints_of, training_settings
+from lerobot_unimask.evaluating import rollouts
+
+
+def learning_curve(
+    runs: Sequence[Path], env_type: str, *, episodes: int, last_episodes: int, batch_size: int, seed: int
+) -> dict[str, Any]:
+    """A JSON record of each run's checkpoints.
+
+    Args:
+        episodes: rollouts of each checkpoint, with the same starts for all.
+        last_episodes: rollouts of the last one, whose mean is what the run is judged by.
+    """
+    records = []
+    for run in runs:
+        checkpoints = checkpoints_of(run)
+        points = []
+        for path in checkpoints:
+            count = last_episodes if path == checkpoints[-1] else episodes
+            points.append(rollouts(path, env_type, count, batch_size=min(batch_size, count), seed=seed))
+            result = "{updates} updates: return {mean_return:.3f} +- {standard_error:.3f} over {episodes}".format(
+                **points[-1]
+            )
+            print(f"{run.name}: {result}, {points[-1]['seconds']} s", flush=True)
+        records.append(
+            {
+                "run": run.name,
+                "checkpoints": points,
+                "training_seconds_per_update": _seconds_per_update(checkpoints, points),
+                "training": training_settings(checkpoints[-1]),
+            }
+        )
+    return {
+        "what": "mean return of LeRobot's evaluation, most likely actions unless the settings say otherwise",
+        "environment": env_type,
+        "seed": seed,
+        "runs": records,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("torch", "lerobot", "lerobot_policy_unimask")},
+        },
+    }
+
+
+def _seconds_per_update(checkpoints: Sequence[Path], points: Sequence[dict[str, Any]]) -> float | None:
+    """Wall time of training from the first checkpoint to the last, evaluations in between included."""
+    if len(checkpoints) < 2:
+        return None
+    first, last = ((path / "model.safetensors").stat().st_mtime for path in (checkpoints[0], checkpoints[-1]))
+    return round((last - first) / (points[-1]["updates"] - points[0]["updates"]), 4)

@@ -1,0 +1,314 @@
+"""The Hub in one place: what is pushed, in one commit; what is fetched, and checked; errors that say what to do.
+
+The client is huggingface_hub, so `HF_ENDPOINT`, `HF_TOKEN`, `HF_HUB_OFFLINE` and its cache work as everywhere else.
+"""
+
+import functools
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token, snapshot_download
+from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
+from huggingface_hub.errors import (
+    EntryNotFoundError,
+    HfHubHTTPError,
+    HFValidationError,
+    LocalEntryNotFoundError,
+    OfflineModeIsEnabled,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
+from huggingface_hub.file_download import repo_folder_name
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import dataset_metadata, lerobot_dataset
+from lerobot.datasets.utils import get_safe_version
+from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
+
+from lerobot_unimask.data.episodes import check_folder
+
+if TYPE_CHECKING:
+    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+
+class HubError(OSError):
+    """One sentence: what is missing or went wrong, and what to do about it."""
+
+
+class Origin(NamedTuple):
+    """Where a policy was loaded from: a repository and its commit, or a folder, which has none."""
+
+    repository: str
+    revision: str | None
+
+
+def fetch(repo_id: str, *, revision: str | None = None, **download: Any) -> Path:
+    """The folder of a policy's files, all of one commit, from the cache or the Hub.
+
+    Args:
+        revision: a branch, tag or commit; None: the newest.
+        download: further arguments of `snapshot_download`.
+
+    Raises:
+        HubError: anything is missing, cannot be reached, or does not have the content that its hash names; of what
+            failed nothing stays in the cache. Also where loading it would run code that the repository names.
+    """
+    with _pull_errors(repo_id, revision):
+        # The processors too: LeRobot's commands read them later, and may be offline then.
+        patterns = {"allow_patterns": ["*.json", "*.safetensors"], "ignore_patterns": ["*/*"]}
+        folder = Path(snapshot_download(repo_id, revision=revision, **patterns, **download))
+        for name in (CONFIG_NAME, SAFETENSORS_SINGLE_FILE):
+            if not (folder / name).exists():
+                raise LocalEntryNotFoundError(name) if constants.is_offline_mode() else EntryNotFoundError(name)
+    damaged = [path for path in sorted(folder.iterdir()) if _damaged(path)]
+    for path in damaged:
+        path.resolve().unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+    if damaged:
+        raise HubError(
+            f"{', '.join(path.name for path in damaged)} of {repo_id} arrived damaged: the content is not that of the "
+            "hash that the Hub names; it has been removed from the cache, so run this again to fetch it anew."
+        )
+    _check_processors(folder, repo_id)
+    return folder
+
+
+def commit_of(folder: Path) -> str | None:
+    """The commit that a folder of the client's cache is of; None for any other folder."""
+    return folder.name if folder.parent.name == "snapshots" and re.fullmatch("[0-9a-f]{40}", folder.name) else None
+
+
+def _damaged(path: Path) -> bool:
+    """The client checks a download's length alone. Its cache names each file by its hash: sha256, or git's sha1."""
+    blob = path.resolve()
+    digest = {40: hashlib.sha1, 64: hashlib.sha256}.get(len(blob.name))
+    if digest is None or not re.fullmatch("[0-9a-f]+", blob.name):  # no cache of hashes, as on a disk without links
+        return False
+    data = blob.read_bytes()
+    return digest((b"blob %d\0" % len(data) if len(blob.name) == 40 else b"") + data).hexdigest() != blob.name
+
+
+def _check_processors(folder: Path, repo_id: str) -> None:
+    """LeRobot imports and calls whatever a step names as its `class`; its own steps go by registered names."""
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        steps = json.loads((folder / name).read_text())["steps"] if (folder / name).exists() else []
+        if any("registry_name" not in step for step in steps):
+            raise HubError(f"{name} of {repo_id} names code to run; a unimask policy's steps are LeRobot's own alone.")
+
+
+@contextmanager
+def _pull_errors(repo_id: str, revision: str | None) -> Iterator[None]:
+    try:
+        yield
+    except HFValidationError as error:
+        raise HubError(
+            f"{repo_id!r} is neither a folder on this machine nor the name of a repository on the Hub, ME/NAME."
+        ) from error
+    except RepositoryNotFoundError as error:
+        raise HubError(
+            f"The Hub at {constants.ENDPOINT} has no model {repo_id} that you may read: check the name and, if it is "
+            "private, log in with `hf auth login` or set HF_TOKEN."
+        ) from error
+    except RevisionNotFoundError as error:
+        raise HubError(f"{repo_id} has no revision {revision!r} on the Hub; `main` is its newest.") from error
+    except LocalEntryNotFoundError as error:
+        reason = f"the Hub at {constants.ENDPOINT} cannot be reached: try again once it can"
+        if constants.is_offline_mode():
+            reason = "HF_HUB_OFFLINE=1 forbids asking the Hub for it: run this once without HF_HUB_OFFLINE"
+        raise HubError(f"The policy {repo_id} has not been pulled to this machine, and {reason}.") from error
+    except EntryNotFoundError as error:
+        raise HubError(
+            f"{repo_id} holds no {error}{f' at revision {revision!r}' if revision else ''}: it is not a policy, or its "
+            f"first push has not been finished; `unimask push --policy.path=DIR --repo_id={repo_id}` does so."
+        ) from error
+    except HfHubHTTPError as error:
+        raise HubError(f"{repo_id} cannot be pulled: {_refusal(error)}") from error
+    except (httpx.HTTPError, OSError) as error:
+        raise HubError(
+            f"The download of {repo_id} broke off ({_first_line(error)}): no file of which a part is missing has been "
+            "kept, so run this again."
+        ) from error
+
+
+def install() -> None:
+    """Let LeRobot's own commands keep to what was pulled before, with HF_HUB_OFFLINE=1, and name what was not.
+
+    LeRobot asks the Hub for a dataset's versions even if it has the dataset, and reads a policy's config, whatever its
+    type, before it calls the policy. Does nothing the second time.
+    """
+    if dataset_metadata.get_safe_version is _pulled_version:
+        return
+    dataset_metadata.get_safe_version = lerobot_dataset.get_safe_version = _pulled_version
+    read = PreTrainedConfig.from_pretrained.__func__
+
+    @functools.wraps(read)
+    def read_or_name(cls: type, pretrained_name_or_path: str | Path, **kwargs: Any) -> PreTrainedConfig:
+        try:
+            return read(cls, pretrained_name_or_path, **kwargs)
+        except LocalEntryNotFoundError:
+            with _pull_errors(str(pretrained_name_or_path), kwargs.get("revision")):
+                raise
+
+    PreTrainedConfig.from_pretrained = classmethod(read_or_name)
+
+
+def _pulled_version(repo_id: str, version: Any, **kwargs: Any) -> str:
+    """In place of LeRobot's `get_safe_version`: offline, the version that is asked for, if it has been pulled."""
+    if not constants.is_offline_mode():
+        return get_safe_version(repo_id, version, **kwargs)
+    place = HF_LEROBOT_HUB_CACHE / repo_folder_name(repo_id=repo_id, repo_type="dataset") / "refs" / str(version)
+    if not place.exists():
+        raise HubError(
+            f"The dataset {repo_id} has not been pulled to this machine, and HF_HUB_OFFLINE=1 forbids asking the Hub "
+            "for it: run this once without HF_HUB_OFFLINE, or give its folder with --dataset.root."
+        )
+    return str(version)
+
+
+def push_policy(
+    policy: "UniMASKPolicy",
+    folder: Path,
+    repo_id: str,
+    *,
+    private: bool | None = None,
+    command: str | None = None,
+    results: Sequence[Mapping[str, Any]] = (),
+    saved: Path | None = None,
+) -> str:
+    """Push a saved policy with its card: config, weights, processors and train config in one commit.
+
+    Args:
+        policy: the policy that is saved in `folder`.
+        folder: as `save_pretrained` or lerobot-train writes it.
+        private: whether to create the repository as a private one.
+        command: the training command; without one the card has the train config's.
+        results: records for the card, see `cards.policy_card`.
+        saved: where the user finds it, if `folder` is a passing one.
+
+    Returns:
+        The repository's address.
+
+    Raises:
+        HubError: it could not be pushed. Nothing of it is to be seen on the Hub then.
+    """
+    from lerobot_unimask.sharing import cards
+
+    train_config = folder / "train_config.json"
+    card = cards.policy_card(
+        policy,
+        repo_id,
+        train_config=json.loads(train_config.read_text()) if train_config.exists() else None,
+        command=command,
+        results=results,
+    )
+    files = {path.name: path for pattern in ("*.json", "*.safetensors") for path in sorted(folder.glob(pattern))}
+    return _push(
+        {**files, **card},
+        repo_id,
+        kind="model",
+        private=private,
+        message="Upload policy: weights, config, processors, train config and card",
+        again=f"unimask push --policy.path={shlex.quote(str(saved or folder))} --repo_id={repo_id}",
+    )
+
+
+def push_dataset(root: Path, repo_id: str, *, private: bool | None = None) -> str:
+    """Push a LeRobotDataset with its card in one commit, and tag that with the version that LeRobot asks for.
+
+    The repository then holds these files and no others. See `push_policy` for the rest.
+    """
+    from lerobot_unimask.sharing import cards
+
+    check_folder(root)
+    paths = {path.relative_to(root): path for path in sorted(root.rglob("*")) if path.is_file()}
+    files = {
+        path.as_posix(): place for path, place in paths.items() if not any(part.startswith(".") for part in path.parts)
+    }
+    return _push(
+        {**files, **cards.dataset_card(root, repo_id)},
+        repo_id,
+        kind="dataset",
+        private=private,
+        message="Upload dataset and card",
+        again=f"unimask push --dataset.root={shlex.quote(str(root))} --repo_id={repo_id}",
+        tag=json.loads((root / "meta" / "info.json").read_text())["codebase_version"],
+    )
+
+
+def _push(
+    files: Mapping[str, Path | bytes],
+    repo_id: str,
+    *,
+    kind: str,
+    private: bool | None,
+    message: str,
+    again: str,
+    tag: str | None = None,
+) -> str:
+    """Make one commit of all files; with a tag, of these files alone, and let the tag name it."""
+    api = HfApi()
+    with _push_errors(repo_id, again):
+        url = api.create_repo(repo_id, repo_type=kind, private=private, exist_ok=True)
+        repo_id = url.repo_id
+        # The client leaves out what the head has already, so the commit is whole on this head alone.
+        head = api.repo_info(repo_id, repo_type=kind).sha
+        operations: list[Any] = [CommitOperationAdd(path, content) for path, content in files.items()]
+        if tag is not None:
+            there = api.list_repo_files(repo_id, repo_type=kind, revision=head)
+            operations += [CommitOperationDelete(path) for path in there if path not in {*files, ".gitattributes"}]
+        commit = api.create_commit(repo_id, operations, commit_message=message, repo_type=kind, parent_commit=head)
+        if tag is not None:
+            _set_tag(api, repo_id, kind, tag, commit.oid)
+    return url.url
+
+
+def _set_tag(api: HfApi, repo_id: str, kind: str, tag: str, commit: str) -> None:
+    tagged = {ref.name: ref.target_commit for ref in api.list_repo_refs(repo_id, repo_type=kind).tags}
+    if tagged.get(tag) == commit:
+        return
+    if tag in tagged:  # a tag cannot be moved
+        api.delete_tag(repo_id, tag=tag, repo_type=kind)
+    api.create_tag(repo_id, tag=tag, revision=commit, repo_type=kind)
+
+
+@contextmanager
+def _push_errors(repo_id: str, again: str) -> Iterator[None]:
+    nothing = f"nothing of this push is to be seen there. Push it again with:\n  {again}"
+    try:
+        yield
+    except HFValidationError as error:
+        raise HubError(f"{repo_id!r} is not a repository's name; names are ME/NAME.") from error
+    except OfflineModeIsEnabled as error:
+        raise HubError(f"HF_HUB_OFFLINE=1 forbids pushing {repo_id}; without it, push with:\n  {again}") from error
+    except (HfHubHTTPError, httpx.HTTPError, RuntimeError) as error:
+        # The client's uploads report a RuntimeError, with what happened as its cause.
+        cause = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error
+        status = cause.response.status_code if isinstance(cause, HfHubHTTPError) else None
+        if status == 401:
+            token = "refuses your token" if get_token() else "wants a token"
+            reason = f"the Hub at {constants.ENDPOINT} {token}: log in with `hf auth login` or set HF_TOKEN"
+        elif status == 403:
+            reason = f"your token may not write there; {repo_id.split('/')[0]} is its owner's name"
+        elif status == 412:
+            reason = "somebody else has pushed there in the meantime"
+        else:
+            reason = _refusal(cause).rstrip(".")
+        raise HubError(f"{repo_id} has not been pushed: {reason}; {nothing}") from error
+
+
+def _refusal(error: BaseException) -> str:
+    if isinstance(error, HfHubHTTPError):
+        if error.response.status_code == 401:
+            return f"the Hub at {constants.ENDPOINT} refuses your token: log in with `hf auth login` or set HF_TOKEN."
+        return f"the Hub at {constants.ENDPOINT} answers with status {error.response.status_code}: try again later."
+    return f"the connection to the Hub at {constants.ENDPOINT} failed ({_first_line(error)})."
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).strip().splitlines()[0].rstrip(".")
