@@ -180,7 +180,7 @@ def _run(script: str, *arguments: str) -> None:
 def _states(answer: Answer) -> dict:
     """Each step's distribution of agent and key, and which steps were shown."""
     return {
-        "shown": answer.mask.visible["s"][0].nonzero().flatten().tolist(),
+        "shown": answer.mask.shown["s"][0].nonzero().flatten().tolist(),
         **{part.name: torch.round(part.probabilities[0], decimals=4).tolist() for part in answer["s"]},
     }
 

@@ -76,7 +76,7 @@ def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
         mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
         answer = answer_question(policy.predict, policy.statistics, policy.factors, recorded, mask)
         error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.a_std
-        errors.append(error[mask.predict["a"][:, t]].square().flatten())
+        errors.append(error[mask.asked["a"][:, t]].square().flatten())
     return torch.cat(errors).mean().item()
 
 
@@ -90,12 +90,12 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     found = []
     for t in table.t.tolist():
         mask: Mask = table.at(t, len(window.valid)).to(policy.device).within(window.valid)
-        causal, both = (policy.network(window, mask.visible, direction)["a"] for direction in (True, False))
+        causal, both = (policy.network(window, mask.shown, direction)["a"] for direction in (True, False))
         components = policy.factors["a"].components
         parts = [
             _divergence(p[:, t], q[:, t], component) for p, q, component in zip(causal, both, components, strict=True)
         ]
-        found.append(sum(parts)[mask.predict["a"][:, t]])
+        found.append(sum(parts)[mask.asked["a"][:, t]])
     return torch.cat(found).mean().item()
 
 

@@ -180,8 +180,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         step = self.updates if self.training else VALIDATION_STEP
         mask = self.training_masks(window.valid, _index(batch, window), seed=self.config.mask_seed, step=step)
         window = self.statistics.normalise(window)
-        predictions = self.network(window, mask.visible, mask.causal)
-        losses = masked_losses(predictions, window, mask.predict, self.factors)
+        predictions = self.network(window, mask.shown, mask.causal)
+        losses = masked_losses(predictions, window, mask.asked, self.factors)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
         return loss, LossParts({f"loss_{name}": part.detach() for name, part in losses.items()})
 
@@ -207,8 +207,8 @@ class UniMASKPolicy(PreTrainedPolicy):
             MaskError: the model attends causally alone and has not learnt to answer this.
         """
         causally = self.training_masks.answered_causally(mask)
-        if all(torch.equal(causally[name], mask.predict[name]) for name in causally):
-            return self.network(window, mask.visible, True, cache)
+        if all(torch.equal(causally[name], mask.asked[name]) for name in causally):
+            return self.network(window, mask.shown, True, cache)
         if self.config.attention == "causal":
             raise MaskError(
                 "This model attends causally alone. It was trained on "
@@ -216,9 +216,9 @@ class UniMASKPolicy(PreTrainedPolicy):
                 "it. A model of attention=both answers any question.",
                 mask.draw(),
             )
-        predictions = self.network(window, mask.visible, False)
+        predictions = self.network(window, mask.shown, False)
         if any(tokens.any() for tokens in causally.values()):
-            for name, outputs in self.network(window, mask.visible, True).items():
+            for name, outputs in self.network(window, mask.shown, True).items():
                 here = causally[name].unsqueeze(-1)
                 pairs = zip(outputs, predictions[name], strict=True)
                 predictions[name] = [torch.where(here, causal, other) for causal, other in pairs]
@@ -335,15 +335,15 @@ class UniMASKPolicy(PreTrainedPolicy):
         tokens = read_given(given or {}, self.factors, K, batch_size)
         known = {}
         for name, value in window.values.items():
-            lacking = mask.visible[name] & value.isnan().any(-1)  # as in a sample, or a column that is not there
+            lacking = mask.shown[name] & value.isnan().any(-1)  # as in a sample, or a column that is not there
             known[name] = torch.full((K,), recorded) & ~lacking.any(0).cpu()
         for name, step in tokens:  # here the user changes a recorded window on purpose
             known[name][step] = False
         window, known = give(window, tokens, known)
-        check_shown(tokens, mask.visible, text)
+        check_shown(tokens, mask.shown, text)
         check_known(mask, known, text)
         for name, value in window.values.items():
-            check_values(f"A shown token of {name}", value[mask.visible[name]], self.factors[name])
+            check_values(f"A shown token of {name}", value[mask.shown[name]], self.factors[name])
         return window, mask
 
     def _table(self, text: str) -> MaskTable:

@@ -159,14 +159,14 @@ def ask(
     posed = question.to(policy.device)
     if recorded is not None:
         posed = posed.within(recorded.valid)
-        if not any(asked.any() for asked in posed.predict.values()):
+        if not any(asked.any() for asked in posed.asked.values()):
             raise ValueError(
                 f"The episode ends before what is asked: of the window's {policy.config.context_length} steps it has "
                 f"{int(recorded.valid.sum())}. Start earlier or ask for an earlier step."
             )
     if sampling is None:
         answer = policy.infer(recorded, mask, t=t, given=given)
-        windows = len(answer.mask.visible["s"])
+        windows = len(answer.mask.shown["s"])
     else:
         answer = policy.sample(
             recorded,
@@ -216,7 +216,7 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
     table = []
     for step in range(K):
         for name in ASKABLE:
-            if not reply.mask.predict[name][0, step]:
+            if not reply.mask.asked[name][0, step]:
                 continue
             for component in policy.factors[name].components:
                 for i in range(component.dims.start, component.dims.stop):
@@ -427,7 +427,7 @@ def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, maze: str = "medi
         maze: Maze2D's, see `maze_of`.
     """
     states = _labels(policy)["s"]
-    every_state = bool((reply.mask.visible["s"] | reply.mask.predict["s"]).all())
+    every_state = bool((reply.mask.shown["s"] | reply.mask.asked["s"]).all())
     if isinstance(reply.answer, Samples):
         if states == DOORKEY and every_state:
             return trajectories({mask: reply.answer.values["s"].long().numpy(force=True)})
@@ -437,12 +437,12 @@ def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, maze: str = "medi
         return distributions(groups, policy.factors)
     if states == DOORKEY and every_state:
         return state_distributions(reply.answer)
-    if states == MAZE2D and reply.mask.predict["s"].any():
+    if states == MAZE2D and reply.mask.asked["s"].any():
         return maze_trajectories(reply.answer, reply.recorded, maze=maze)
     return marginals(reply.answer, reply.recorded)
 
 
 def _known(window: Window, mask: Mask) -> Window:
     """The window with NaN where nothing was asked."""
-    values = {name: torch.where(mask.predict[name].unsqueeze(-1), window.values[name], torch.nan) for name in ASKABLE}
+    values = {name: torch.where(mask.asked[name].unsqueeze(-1), window.values[name], torch.nan) for name in ASKABLE}
     return Window(values, window.valid)

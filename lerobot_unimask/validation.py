@@ -68,7 +68,7 @@ def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable
     for text in masks:
         mask = question_masks(policy, window, index, text)
         predictions = policy.predict(normalised, mask)
-        parts = masked_losses(predictions, normalised, mask.predict, policy.factors)
+        parts = masked_losses(predictions, normalised, mask.asked, policy.factors)
         losses[text] = sum(part.item() for part in parts.values())
     return losses
 
@@ -97,12 +97,12 @@ def beside_optimum(
     for text in masks:
         mask = question_masks(policies[0], window, index, text)
         exact = optimum(window, mask)
-        parts = masked_losses(exact, window, mask.predict, policies[0].factors)
+        parts = masked_losses(exact, window, mask.asked, policies[0].factors)
         record["losses"][text] = sum(part.item() for part in parts.values())
-        record["expected_losses"][text] = mean_over_asked(entropies(exact), mask.predict)
+        record["expected_losses"][text] = mean_over_asked(entropies(exact), mask.asked)
         for policy, values, distance in zip(policies, normalised, distances, strict=True):
             predictions = policy.predict(values, mask)
-            distance["divergence"][text] = mean_over_asked(divergences(exact, predictions), mask.predict)
+            distance["divergence"][text] = mean_over_asked(divergences(exact, predictions), mask.asked)
     if RANDOM_MASK in masks:
         for policy, values, distance in zip(policies, normalised, distances, strict=True):
             distance["random_mask_divergence"] = random_mask_divergence(optimum, policy.predict, window, values, index)
@@ -120,7 +120,7 @@ def probability_of_truth(policy: UniMASKPolicy, batch: dict[str, Tensor], text: 
     answer = policy.infer(window, mask)
     probabilities = []
     for name, distributions in answer.distributions.items():
-        asked = mask.predict[name]
+        asked = mask.asked[name]
         token = torch.ones(int(asked.sum()), device=policy.device)
         for distribution in distributions:
             truth = window.values[name][..., distribution.component.dims].long()

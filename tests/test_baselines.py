@@ -36,13 +36,13 @@ def policy(tiny_policy):
     return make
 
 
-def window_and_visible(policy, batch, seed=0):
+def window_and_shown(policy, batch, seed=0):
     """A normalised window, and tokens shown at random; of the return the first, in every second window."""
     window = policy.statistics.normalise(policy.make_window(batch))
     generator = torch.Generator().manual_seed(seed)
-    visible = {name: torch.rand(window.valid.shape, generator=generator) < 0.5 for name in policy.factors}
-    visible["rtg"] = (torch.arange(len(window.valid))[:, None] % 2 == 0) & (torch.arange(K) == 0)
-    return window, Mask(visible, visible).within(window.valid).visible
+    shown = {name: torch.rand(window.valid.shape, generator=generator) < 0.5 for name in policy.factors}
+    shown["rtg"] = (torch.arange(len(window.valid))[:, None] % 2 == 0) & (torch.arange(K) == 0)
+    return window, Mask(shown, shown).within(window.valid).shown
 
 
 # --- What every network must keep ------------------------------------------------------------------------------------
@@ -51,9 +51,9 @@ def window_and_visible(policy, batch, seed=0):
 @pytest.mark.parametrize("network", OTHERS)
 def test_predictions_have_the_same_form_for_every_network(policy, doorkey_batch, network):
     tested, usual = policy(network), policy("transformer")
-    window, visible = window_and_visible(tested, doorkey_batch)
-    expected = usual.network(window, visible)
-    predictions = tested.network(window, visible)
+    window, shown = window_and_shown(tested, doorkey_batch)
+    expected = usual.network(window, shown)
+    predictions = tested.network(window, shown)
     assert list(predictions) == list(expected) == ["s", "a"]
     for name, outputs in predictions.items():
         assert [output.shape for output in outputs] == [output.shape for output in expected[name]]
@@ -63,31 +63,31 @@ def test_predictions_have_the_same_form_for_every_network(policy, doorkey_batch,
 def test_a_hidden_value_changes_nothing_not_even_a_nan(policy, doorkey_batch, network):
     """A Decision Transformer reads the later returns where the first is shown: those are shown with it."""
     tested = policy(network)
-    window, visible = window_and_visible(tested, doorkey_batch)
-    shown = dict(visible)
+    window, shown = window_and_shown(tested, doorkey_batch)
+    read = dict(shown)
     if network == "decision_transformer":
-        shown["rtg"] = visible["rtg"][:, :1].expand(-1, K)
-    before = flat(tested.network(window, visible))
+        read["rtg"] = shown["rtg"][:, :1].expand(-1, K)
+    before = flat(tested.network(window, shown))
     assert before.isfinite().all()
     for wrong in (math.nan, math.inf, -1e9, 1.0):
-        values = {name: torch.where(shown[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
+        values = {name: torch.where(read[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
         if network == "decision_transformer":  # the timestep, too, is read whether or not the return is shown
             values["rtg"][..., -1] = window.values["rtg"][..., -1]
         changed = Window(values, window.valid)
-        torch.testing.assert_close(flat(tested.network(changed, visible)), before, rtol=0, atol=0)
+        torch.testing.assert_close(flat(tested.network(changed, shown)), before, rtol=0, atol=0)
         tested.zero_grad()
-        flat(tested.network(changed, visible)).square().mean().backward()
+        flat(tested.network(changed, shown)).square().mean().backward()
         assert all(p.grad is None or p.grad.isfinite().all() for p in tested.network.parameters())
 
 
 @pytest.mark.parametrize("network", OTHERS)
 def test_windows_do_not_see_each_other(policy, doorkey_batch, network):
     tested = policy(network)
-    window, visible = window_and_visible(tested, doorkey_batch)
-    together = flat(tested.network(window, visible))
+    window, shown = window_and_shown(tested, doorkey_batch)
+    together = flat(tested.network(window, shown))
     for b in range(len(window.valid)):
         alone = Window({name: value[b : b + 1] for name, value in window.values.items()}, window.valid[b : b + 1])
-        output = flat(tested.network(alone, {name: shown[b : b + 1] for name, shown in visible.items()}))
+        output = flat(tested.network(alone, {name: tokens[b : b + 1] for name, tokens in shown.items()}))
         torch.testing.assert_close(output[0], together[b], rtol=1e-4, atol=1e-5)
 
 
@@ -118,7 +118,7 @@ def test_training_lowers_the_loss_and_a_checkpoint_answers_the_same(policy, door
 def test_the_future_changes_no_past(policy, doorkey_batch, network):
     """Everything shown; a value changed at one token changes the predictions of later tokens and of no others."""
     tested = policy(network)
-    window, _ = window_and_visible(tested, doorkey_batch)
+    window, _ = window_and_shown(tested, doorkey_batch)
     everything = {name: torch.ones_like(window.valid) for name in tested.factors}
     everything["rtg"] = everything["rtg"] & (torch.arange(K) == 0)
     window = Window({name: value[:6] for name, value in window.values.items()}, window.valid[:6])
@@ -191,14 +191,14 @@ def test_in_a_rollout_each_step_has_the_return_that_is_left(policy, load_doorkey
     seen, rewards = played(tested)
     mean, std = tested.statistics.rtg_mean[0], tested.statistics.rtg_std[0]
     left = [6.0 - sum(rewards[:step]) for step in range(10)]
-    for step, (window, visible, *_) in enumerate(seen):
+    for step, (window, shown, *_) in enumerate(seen):
         first = max(0, step - context_length + 1)
         now = step - first
         returns = window.values["rtg"][0, :, 0] * std + mean
         torch.testing.assert_close(returns[: now + 1], torch.tensor(left[first : step + 1]))
         timesteps = window.values["rtg"][0, : now + 1, 1] * 10
         torch.testing.assert_close(timesteps, torch.arange(first, step + 1.0))
-        assert visible["rtg"][0].tolist() == [True] + [False] * (context_length - 1)
+        assert shown["rtg"][0].tolist() == [True] + [False] * (context_length - 1)
 
 
 def test_acting_and_a_recorded_window_agree(policy, doorkey):
@@ -237,13 +237,13 @@ def test_a_decision_transformer_needs_returns(doorkey, policy):
 
 def test_the_returns_that_are_read_matter(policy, doorkey_batch):
     tested = policy("decision_transformer")
-    window, _ = window_and_visible(tested, doorkey_batch)
+    window, _ = window_and_shown(tested, doorkey_batch)
     everything = {name: torch.ones_like(window.valid) for name in tested.factors}
     other = Window({name: value.clone() for name, value in window.values.items()}, window.valid)
     other.values["rtg"][:, 5, 0] += 1
     cloning = everything | {"rtg": torch.zeros_like(window.valid)}
-    for visible, same in ((everything, False), (cloning, True)):
-        before, after = tested.network(window, visible), tested.network(other, visible)
+    for shown, same in ((everything, False), (cloning, True)):
+        before, after = tested.network(window, shown), tested.network(other, shown)
         assert torch.equal(outputs_at(before, "a", 4), outputs_at(after, "a", 4))
         assert torch.equal(outputs_at(before, "a", 5), outputs_at(after, "a", 5)) == same
 
@@ -253,13 +253,13 @@ def test_the_returns_that_are_read_matter(policy, doorkey_batch):
 
 def test_every_shown_value_reaches_every_prediction(policy, doorkey_batch):
     tested = policy("feedforward")
-    window, visible = window_and_visible(tested, doorkey_batch)
-    before = tested.network(window, visible)
+    window, shown = window_and_shown(tested, doorkey_batch)
+    before = tested.network(window, shown)
     for name in ("s", "a"):
-        for b, k in visible[name].nonzero().tolist():
+        for b, k in shown[name].nonzero().tolist():
             values = {other: value.clone() for other, value in window.values.items()}
             values[name][b, k, 0] = (values[name][b, k, 0] + 1) % 4
-            after = tested.network(Window(values, window.valid), visible)
+            after = tested.network(Window(values, window.valid), shown)
             for asked in ("s", "a"):
                 for old, new in zip(before[asked], after[asked], strict=True):
                     assert (old != new).any(-1)[b].all()

@@ -32,7 +32,7 @@ def exact_network(window, mask, cache=None):
     agrees = torch.ones(B, 36, dtype=torch.bool)
     for i, (name, step) in enumerate(TOKENS):
         same = window.values[name][:, step] == OUTCOMES[:, i]  # (B, 36)
-        agrees &= same | ~mask.visible[name][:, step, None]
+        agrees &= same | ~mask.shown[name][:, step, None]
     weights = JOINT * agrees
     predictions = {}
     for name, count in (("s", 2), ("a", 3)):
@@ -102,7 +102,7 @@ def test_orders_are_what_they_are_called():
         seen = []
 
         def spy(window, mask, cache):
-            shown = mask.visible.items()
+            shown = mask.shown.items()
             seen.append({(name, k) for name, here in shown for k in here[0].nonzero().flatten().tolist()})
             return exact_network(window, mask)
 
@@ -126,19 +126,19 @@ def test_each_window_is_asked_its_own_question():
     window = empty_window(3)
     window.values["a"][1, 0] = 1.0
     no, yes = torch.zeros(3, K, dtype=torch.bool), torch.ones(3, K, dtype=torch.bool)
-    visible, predict = {"s": no.clone(), "a": no.clone()}, {"s": yes.clone(), "a": yes.clone()}
-    visible["a"][1, 0] = True
-    predict["s"][1], predict["a"][1] = torch.tensor([False, True]), torch.tensor([False, False])
-    predict["s"][2], predict["a"][2] = False, False
-    before = {name: shown.clone() for name, shown in visible.items()}
+    shown, asked = {"s": no.clone(), "a": no.clone()}, {"s": yes.clone(), "a": yes.clone()}
+    shown["a"][1, 0] = True
+    asked["s"][1], asked["a"][1] = torch.tensor([False, True]), torch.tensor([False, False])
+    asked["s"][2], asked["a"][2] = False, False
+    before = {name: tokens.clone() for name, tokens in shown.items()}
     for order in ORDERS:
-        drawn = draw(window, Mask(visible, predict), order)
+        drawn = draw(window, Mask(shown, asked), order)
         known = {name: ~value[..., 0].isnan() for name, value in drawn.values.items()}
         assert known["s"].tolist() == [[True, True], [False, True], [False, False]]
         assert known["a"].tolist() == [[True, True], [True, False], [False, False]]
         assert drawn.values["a"][1, 0] == 1
     assert window.values["s"].isnan().all()
-    assert all(torch.equal(visible[name], before[name]) for name in visible)
+    assert all(torch.equal(shown[name], before[name]) for name in shown)
 
 
 def test_the_same_seed_draws_the_same_samples():

@@ -23,7 +23,7 @@ def question():
 
 
 def make_question(factors):
-    """(predictions, window, predict)"""
+    """(predictions, window, asked)"""
     generator = torch.Generator().manual_seed(0)
     cells = torch.stack([torch.randint(0, n, (B, K), generator=generator) for n in (5, 3)], dim=-1)
     values = {
@@ -34,17 +34,17 @@ def make_question(factors):
         name: [torch.randn(B, K, c.size, generator=generator).requires_grad_() for c in factor.components]
         for name, factor in factors.items()
     }
-    predict = {name: torch.rand(B, K, generator=generator) < 0.4 for name in FACTORS}
-    return predictions, Window(values, torch.ones(B, K, dtype=torch.bool)), predict
+    asked = {name: torch.rand(B, K, generator=generator) < 0.4 for name in FACTORS}
+    return predictions, Window(values, torch.ones(B, K, dtype=torch.bool)), asked
 
 
-def slow_losses(predictions, window, predict, factors):
+def slow_losses(predictions, window, asked, factors):
     losses = {}
     for name, factor in factors.items():
-        losses[name], count = 0.0, int(predict[name].sum())
+        losses[name], count = 0.0, int(asked[name].sum())
         for b in range(B):
             for k in range(K):
-                if not predict[name][b, k]:
+                if not asked[name][b, k]:
                     continue
                 value = window.values[name][b, k].tolist()
                 for output, component in zip(predictions[name], factor.components, strict=True):
@@ -110,25 +110,25 @@ def test_a_perfect_prediction_costs_nothing():
 
 
 def test_what_is_not_asked_does_not_matter_not_even_a_nan(question):
-    predictions, window, predict = question
-    loss = sum(masked_losses(predictions, window, predict, FACTORS).values())
+    predictions, window, asked = question
+    loss = sum(masked_losses(predictions, window, asked, FACTORS).values())
     outputs = [output for name in FACTORS for output in predictions[name]]
     gradients = torch.autograd.grad(loss, outputs)
     for wrong in (float("nan"), float("inf"), -3.0, 1e9):
-        values = {name: torch.where(predict[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
-        other = sum(masked_losses(predictions, Window(values, window.valid), predict, FACTORS).values())
+        values = {name: torch.where(asked[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
+        other = sum(masked_losses(predictions, Window(values, window.valid), asked, FACTORS).values())
         assert torch.equal(other, loss)
         for gradient, expected in zip(torch.autograd.grad(other, outputs), gradients, strict=True):
             assert torch.equal(gradient, expected)
     for name in FACTORS:
         for output in predictions[name]:
             gradient = gradients[[output is o for o in outputs].index(True)]
-            assert torch.equal(gradient.abs().sum(-1) > 0, predict[name])
+            assert torch.equal(gradient.abs().sum(-1) > 0, asked[name])
 
 
 def test_a_factor_that_is_not_asked_costs_zero_and_can_be_differentiated(question):
-    predictions, window, predict = question
-    losses = masked_losses(predictions, window, {**predict, "a": torch.zeros(B, K, dtype=torch.bool)}, FACTORS)
+    predictions, window, asked = question
+    losses = masked_losses(predictions, window, {**asked, "a": torch.zeros(B, K, dtype=torch.bool)}, FACTORS)
     assert losses["a"].item() == 0
     losses["a"].backward()
     assert predictions["a"][0].grad.abs().sum() == 0

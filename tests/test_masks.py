@@ -90,8 +90,8 @@ def assert_table_is_the_slow_one(text, K):
     table = tabulate(text, FACTORS, K)
     assert table.t.tolist() == [t for t, _, _ in expected]
     for row, (_, shown, asked) in enumerate(expected):
-        assert tokens(table.visible[row], K) == shown
-        assert tokens(table.predict[row], K) == asked
+        assert tokens(table.shown[row], K) == shown
+        assert tokens(table.asked[row], K) == asked
 
 
 @pytest.mark.parametrize("K", [1, 2, 3, 7, 10, 13])
@@ -154,9 +154,9 @@ def test_the_papers_waypoints_for_ten_steps():
 def test_white_space_means_nothing():
     spread = "  a [ t ]|s[ : t  + 1 ] ,\n\ta[ :t ] "
     tight, loose = (tabulate(text, FACTORS, 7) for text in ("a[t]|s[:t+1],a[:t]", spread))
-    assert torch.equal(tight.visible, loose.visible)
-    assert torch.equal(tight.predict, loose.predict)
-    assert torch.equal(tabulate(" past\n", FACTORS, 7).predict, tabulate("past", FACTORS, 7).predict)
+    assert torch.equal(tight.shown, loose.shown)
+    assert torch.equal(tight.asked, loose.asked)
+    assert torch.equal(tabulate(" past\n", FACTORS, 7).asked, tabulate("past", FACTORS, 7).asked)
 
 
 def test_a_slice_with_t_is_clipped_and_never_wraps():
@@ -173,13 +173,13 @@ def test_an_integer_with_t_rules_steps_out():
 def test_a_table_answers_for_the_steps_that_it_admits():
     table = tabulate("past", FACTORS, 4)
     mask = table.at(3, batch_size=2)
-    assert mask.visible["s"].shape == (2, 4)
+    assert mask.shown["s"].shape == (2, 4)
     assert mask.draw(1) == "s ???#  a ???#  rtg ...."
     with pytest.raises(MaskError, match=r"cannot be asked at t=0; it can at t = 1, 2, 3"):
         table.at(0)
     with pytest.raises(MaskError, match="say which"):
         table.at(None)
-    mask.visible["s"][:] = True  # a mask is the caller's to change, the table is everybody's
+    mask.shown["s"][:] = True  # a mask is the caller's to change, the table is everybody's
     assert tabulate("past", FACTORS, 4).at(3).draw() == "s ???#  a ???#  rtg ...."
 
 
@@ -259,7 +259,7 @@ def test_garbage_ends_in_a_mask_error():
     for _ in range(3000):
         text = "".join(rng.choice("sat[]:,+-|0123 \trtg?_(é٣") for _ in range(rng.randint(0, 12)))
         try:
-            assert tabulate(text, FACTORS, 4).predict.any()
+            assert tabulate(text, FACTORS, 4).asked.any()
         except MaskError:
             continue
 

@@ -61,15 +61,15 @@ def random_window(factors, seed=0):
     return Window(values, torch.ones(B, K, dtype=torch.bool))
 
 
-def random_visible(factors, seed=1):
+def random_shown(factors, seed=1):
     """As the language has it: of a property, at most the first step is shown."""
     generator = torch.Generator().manual_seed(seed)
-    visible = {name: torch.rand(B, K, generator=generator) < 0.5 for name in factors}
+    shown = {name: torch.rand(B, K, generator=generator) < 0.5 for name in factors}
     for name in factors:
         if name not in ("s", "a"):
-            visible[name][:, 1:] = False
-            visible[name][:, 0] = torch.tensor([True, False, True])
-    return visible
+            shown[name][:, 1:] = False
+            shown[name][:, 0] = torch.tensor([True, False, True])
+    return shown
 
 
 def flat(predictions):
@@ -88,7 +88,7 @@ def layout(request):
 
 def test_one_output_for_each_component(kind, layout):
     network, factors = make_network(kind, layout)
-    predictions = network(random_window(factors), random_visible(factors))
+    predictions = network(random_window(factors), random_shown(factors))
     assert list(predictions) == ["s", "a"]
     for name, outputs in predictions.items():
         assert [tuple(o.shape) for o in outputs] == [(B, K, c.size) for c in factors[name].components]
@@ -96,18 +96,18 @@ def test_one_output_for_each_component(kind, layout):
 
 def test_a_hidden_value_changes_nothing_not_even_a_nan(kind, layout):
     network, factors = make_network(kind, layout)
-    window, visible = random_window(factors), random_visible(factors)
-    expected = flat(network(window, visible))
+    window, shown = random_window(factors), random_shown(factors)
+    expected = flat(network(window, shown))
     for wrong in (float("nan"), float("inf"), -1e9, 1.0):
-        values = {name: torch.where(visible[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
-        assert torch.equal(flat(network(Window(values, window.valid), visible)), expected)
+        values = {name: torch.where(shown[name].unsqueeze(-1), value, wrong) for name, value in window.values.items()}
+        assert torch.equal(flat(network(Window(values, window.valid), shown)), expected)
 
 
 def test_a_nan_in_a_hidden_place_spoils_no_gradient(kind, layout):
     network, factors = make_network(kind, layout)
-    window, visible = random_window(factors), random_visible(factors)
-    values = {name: torch.where(visible[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()}
-    flat(network(Window(values, window.valid), visible)).square().mean().backward()
+    window, shown = random_window(factors), random_shown(factors)
+    values = {name: torch.where(shown[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()}
+    flat(network(Window(values, window.valid), shown)).square().mean().backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
@@ -116,15 +116,15 @@ def test_a_nan_in_a_hidden_place_spoils_no_gradient(kind, layout):
 
 def test_every_shown_value_changes_every_prediction_of_its_window_and_no_others(kind, layout):
     network, factors = make_network(kind, layout)
-    window, visible = random_window(factors), random_visible(factors)
-    before = network(window, visible)
-    for name, shown in visible.items():
-        for b, k in shown.nonzero().tolist():
+    window, shown = random_window(factors), random_shown(factors)
+    before = network(window, shown)
+    for name, tokens in shown.items():
+        for b, k in tokens.nonzero().tolist():
             for component in factors[name].components:
                 values = {other: value.clone() for other, value in window.values.items()}
                 cell = values[name][b, k, component.dims]
                 cell.copy_((cell + 1) % component.categories if component.discrete else cell + 1)
-                after = network(Window(values, window.valid), visible)
+                after = network(Window(values, window.valid), shown)
                 for asked in ("s", "a"):
                     for old, new in zip(before[asked], after[asked], strict=True):
                         changed = (old != new).any(-1)  # (B, K): attention reaches every step, both ways
@@ -144,11 +144,11 @@ def test_hidden_is_not_zero(kind, layout):
 
 def test_a_windows_answer_is_its_own(kind, layout):
     network, factors = make_network(kind, layout)
-    window, visible = random_window(factors), random_visible(factors)
-    together = flat(network(window, visible))
+    window, shown = random_window(factors), random_shown(factors)
+    together = flat(network(window, shown))
     for b in range(B):
         alone = Window({name: value[b : b + 1] for name, value in window.values.items()}, window.valid[b : b + 1])
-        output = flat(network(alone, {name: shown[b : b + 1] for name, shown in visible.items()}))
+        output = flat(network(alone, {name: tokens[b : b + 1] for name, tokens in shown.items()}))
         torch.testing.assert_close(output[0], together[b], rtol=1e-5, atol=1e-6)
 
 
@@ -163,23 +163,23 @@ def test_steps_are_told_apart(kind, layout):
 
 def test_dropout_is_for_training_alone(kind, layout):
     network, factors = make_network(kind, layout, dropout=0.5)
-    window, visible = random_window(factors), random_visible(factors)
-    assert torch.equal(flat(network(window, visible)), flat(network(window, visible)))
+    window, shown = random_window(factors), random_shown(factors)
+    assert torch.equal(flat(network(window, shown)), flat(network(window, shown)))
     network.train()
-    assert not torch.equal(flat(network(window, visible)), flat(network(window, visible)))
+    assert not torch.equal(flat(network(window, shown)), flat(network(window, shown)))
 
 
 def test_number_encodings_are_those_of_a_loop_over_tokens():
     generator = torch.Generator().manual_seed(0)
     value = torch.randn(20, 6, 2, generator=generator)
-    visible = torch.rand(20, 6, generator=generator) < 0.6
+    shown = torch.rand(20, 6, generator=generator) < 0.6
     encoding = NumberEncoding(2, fine=True)
-    encoded = encoding(torch.where(visible.unsqueeze(-1), value, 0.0), visible)
+    encoded = encoding(torch.where(shown.unsqueeze(-1), value, 0.0), shown)
     assert encoded.shape == (20, 6, encoding.size)
     for b in range(20):
         previous = None
         for k in range(6):
-            if not visible[b, k]:
+            if not shown[b, k]:
                 continue
             numbers = value[b, k].tolist()
             angles = [number * math.pi / 2 * 2**octave for number in numbers for octave in range(4)]
@@ -192,7 +192,7 @@ def test_number_encodings_are_those_of_a_loop_over_tokens():
             previous = k
     plain = NumberEncoding(2, fine=False)
     assert plain.size == 2
-    assert torch.equal(plain(value, visible), value)
+    assert torch.equal(plain(value, shown), value)
 
 
 def slow_course(value, shown, k, causal):
@@ -227,8 +227,8 @@ def test_states_that_go_straight_on_are_predicted_before_anything_is_learnt():
     for parameter in network.heads["s"].parameters():
         torch.nn.init.zeros_(parameter)
     values = random_window(factors).values | {"s": 3 + torch.arange(K).view(1, K, 1) * torch.randn(B, 1, 3)}
-    visible = {name: (torch.arange(K) < 2).expand(B, K) for name in factors}
-    predicted = network(Window(values, torch.ones(B, K).bool()), visible)["s"][0]
+    shown = {name: (torch.arange(K) < 2).expand(B, K) for name in factors}
+    predicted = network(Window(values, torch.ones(B, K).bool()), shown)["s"][0]
     torch.testing.assert_close(predicted[:, 2:], values["s"][:, 2:])
 
 
@@ -246,15 +246,15 @@ def test_a_network_learns_what_a_mask_hides(network, settings):
     states = ((starts[:, None] + torch.arange(K)) % 7).float().unsqueeze(-1)  # (7, K, 1)
     window = Window({"s": states, "a": torch.zeros(7, K, 1)}, torch.ones(7, K, dtype=torch.bool))
     first = (torch.arange(K) == 0).expand(7, K)
-    visible = {"s": first, "a": torch.zeros_like(first)}
+    shown = {"s": first, "a": torch.zeros_like(first)}
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
     for _ in range(250):
-        loss = masked_losses(network(window, visible), window, {"s": ~first, "a": visible["a"]}, factors)["s"]
+        loss = masked_losses(network(window, shown), window, {"s": ~first, "a": shown["a"]}, factors)["s"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
     assert loss < 0.05  # chance is ln 7 = 1.95
-    assert torch.equal(network(window, visible)["s"][0].argmax(-1)[:, 1:], states[:, 1:, 0].long())
+    assert torch.equal(network(window, shown)["s"][0].argmax(-1)[:, 1:], states[:, 1:, 0].long())
 
 
 # --- Causal attention ------------------------------------------------------------------------------------------------
@@ -267,16 +267,16 @@ def in_order(factors):
 
 def test_a_causal_prediction_sees_the_tokens_before_it_and_no_others(kind):
     network, factors = make_network(kind, "separate")
-    window, visible = random_window(factors), random_visible(factors)
-    visible = {name: shown.index_fill(1, torch.tensor(0), True) for name, shown in visible.items()}
+    window, shown = random_window(factors), random_shown(factors)
+    shown = {name: tokens.index_fill(1, torch.tensor(0), True) for name, tokens in shown.items()}
     order = in_order(factors)
-    reference = network(window, visible, True)
+    reference = network(window, shown, True)
     for place, (changed, step) in enumerate(order):
-        shown = visible[changed][:, step]
+        seen = shown[changed][:, step]
         values = {name: value.clone() for name, value in window.values.items()}
         # Another category, or another number
         values[changed][:, step] = torch.where(values[changed][:, step] == 0, 1.0, 0.0)
-        moved = network(Window(values, window.valid), visible, True)
+        moved = network(Window(values, window.valid), shown, True)
         for later, (name, at) in enumerate(order):
             if name not in moved:
                 continue
@@ -286,23 +286,23 @@ def test_a_causal_prediction_sees_the_tokens_before_it_and_no_others(kind):
             if later <= place:
                 assert same.all(), (changed, step, name, at)
             else:
-                assert torch.equal(same, ~shown), (changed, step, name, at)
+                assert torch.equal(same, ~seen), (changed, step, name, at)
 
 
 def test_a_causal_prediction_does_not_depend_on_whether_its_own_token_is_shown(kind):
     network, factors = make_network(kind, "separate")
-    window, visible = random_window(factors), random_visible(factors)
-    other = {name: shown.clone() for name, shown in visible.items()}
+    window, shown = random_window(factors), random_shown(factors)
+    other = {name: tokens.clone() for name, tokens in shown.items()}
     other["a"][:, -1] = ~other["a"][:, -1]
-    for x, y in zip(network(window, visible, True)["a"], network(window, other, True)["a"], strict=True):
+    for x, y in zip(network(window, shown, True)["a"], network(window, other, True)["a"], strict=True):
         assert torch.equal(x, y)
 
 
 def test_each_window_is_read_in_its_own_direction(kind):
     network, factors = make_network(kind, "separate")
-    window, visible = random_window(factors), random_visible(factors)
+    window, shown = random_window(factors), random_shown(factors)
     causal = torch.tensor([True, False, True])
-    mixed, forwards, both = (flat(network(window, visible, direction)) for direction in (causal, True, False))
+    mixed, forwards, both = (flat(network(window, shown, direction)) for direction in (causal, True, False))
     torch.testing.assert_close(mixed, torch.where(causal[:, None], forwards, both))
 
 
@@ -314,18 +314,18 @@ def test_a_rollouts_cache_changes_no_prediction_and_computes_each_token_once(kin
     cache = Cache()
     properties = len(factors) - 2
     for step in range(K):
-        visible = {name: torch.zeros(B, K, dtype=torch.bool) for name in factors}
+        shown = {name: torch.zeros(B, K, dtype=torch.bool) for name in factors}
         for name in factors:
-            visible[name][:, : {"s": step + 1, "a": step}.get(name, 1)] = True
+            shown[name][:, : {"s": step + 1, "a": step}.get(name, 1)] = True
         with torch.no_grad():
-            kept, anew = (network(window, visible, True, c)["a"] for c in (cache, None))
+            kept, anew = (network(window, shown, True, c)["a"] for c in (cache, None))
         for x, y in zip(kept, anew, strict=True):
             torch.testing.assert_close(x[:, step], y[:, step])
     assert counted[::2] == [properties + 1] + [2] * (K - 1)
     # Another history, another question or other environments: what was kept is not used.
-    visible["a"][0, 0] = False
+    shown["a"][0, 0] = False
     with torch.no_grad():
-        kept, anew = (network(window, visible, True, c)["a"] for c in (cache, None))
+        kept, anew = (network(window, shown, True, c)["a"] for c in (cache, None))
     for x, y in zip(kept, anew, strict=True):
         torch.testing.assert_close(x[:, K - 1], y[:, K - 1])
     assert counted[-2] == properties + 2 * K - 1
@@ -333,8 +333,8 @@ def test_a_rollouts_cache_changes_no_prediction_and_computes_each_token_once(kin
 
 def test_mixed_precision_answers_in_full_precision(kind):
     network, factors = make_network(kind, "separate")
-    window, visible = random_window(factors), random_visible(factors)
+    window, shown = random_window(factors), random_shown(factors)
     with torch.autocast("cpu", torch.bfloat16):
-        mixed = flat(network(window, visible))
+        mixed = flat(network(window, shown))
     assert mixed.dtype == torch.float32
-    torch.testing.assert_close(mixed, flat(network(window, visible)), rtol=0.1, atol=0.05)
+    torch.testing.assert_close(mixed, flat(network(window, shown)), rtol=0.1, atol=0.05)

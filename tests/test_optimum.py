@@ -76,7 +76,7 @@ def enumerate_episodes(horizon: int, expert: str) -> tuple[Episodes, np.ndarray]
     return Episodes(agents, keys, doors, actions, reward(agents[:, :-1], agents[:, 1:])), probability
 
 
-def count(episodes: Episodes, weight: np.ndarray, window: Window, visible: dict, first: int) -> tuple[dict, float]:
+def count(episodes: Episodes, weight: np.ndarray, window: Window, shown: dict, first: int) -> tuple[dict, float]:
     """The weighted shares of each token's values among the episodes that agree with what one window shows."""
     K = window.valid.shape[1]
     agent, key = episodes.agent[:, first : first + K], episodes.key[:, first : first + K]
@@ -84,12 +84,12 @@ def count(episodes: Episodes, weight: np.ndarray, window: Window, visible: dict,
     returns = episodes.reward[:, first:].sum(axis=1)
     agrees = np.ones(len(action), dtype=bool)
     for k in range(K):
-        if visible["s"][0, k]:
+        if shown["s"][0, k]:
             shown_agent, shown_key = window.values["s"][0, k].tolist()
             agrees &= (agent[:, k] == shown_agent) & (key[:, k] == shown_key)
-        if visible["a"][0, k]:
+        if shown["a"][0, k]:
             agrees &= action[:, k] == window.values["a"][0, k, 0].item()
-    if visible["rtg"][0, 0]:
+    if shown["rtg"][0, 0]:
         agrees &= returns == window.values["rtg"][0, 0, 0].item()
     weight = weight[agrees]
     shares = {
@@ -99,16 +99,16 @@ def count(episodes: Episodes, weight: np.ndarray, window: Window, visible: dict,
     return shares, weight.sum()
 
 
-def marginals(window: Window, visible: dict, **settings) -> dict[str, np.ndarray]:
+def marginals(window: Window, shown: dict, **settings) -> dict[str, np.ndarray]:
     """The first window's, (K, categories) each."""
-    predictions = Optimum(**settings)(window, showing(visible))
+    predictions = Optimum(**settings)(window, showing(shown))
     (agent, key), (action,) = predictions["s"], predictions["a"]
     return {name: part[0].exp().numpy() for name, part in (("agent", agent), ("key", key), ("action", action))}
 
 
-def showing(visible: dict) -> Mask:
+def showing(shown: dict) -> Mask:
     """A mask that shows these tokens; what it asks for changes no prediction."""
-    return Mask(visible, {name: ~shown for name, shown in visible.items()})
+    return Mask(shown, {name: ~tokens for name, tokens in shown.items()})
 
 
 def row(window: Window, b: int) -> Window:
@@ -130,12 +130,12 @@ def test_marginals_equal_enumeration(monkeypatch, expert, horizon, first, K):
     states = np.stack([episodes.agent, episodes.key], axis=-1)[chosen, first : first + K]
     returns = episodes.reward[chosen, first:].sum(axis=1)
     windows = window_of(states, episodes.action[chosen, first : first + K], returns, first / horizon)
-    visible = {name: torch.from_numpy(rng.random((60, K)) < rng.random((60, 1))) for name in ("s", "a")}
-    visible["rtg"] = (torch.arange(60)[:, None] % 2 == 0) & (torch.arange(K) == 0)
-    together = Optimum(expert, first_step=first)(windows, showing(visible))
+    shown = {name: torch.from_numpy(rng.random((60, K)) < rng.random((60, 1))) for name in ("s", "a")}
+    shown["rtg"] = (torch.arange(60)[:, None] % 2 == 0) & (torch.arange(K) == 0)
+    together = Optimum(expert, first_step=first)(windows, showing(shown))
     for b in range(60):
-        shown = {name: value[b : b + 1] for name, value in visible.items()}
-        expected, _ = count(episodes, probability, row(windows, b), shown, first)
+        one = {name: value[b : b + 1] for name, value in shown.items()}
+        expected, _ = count(episodes, probability, row(windows, b), one, first)
         for name, part in zip(("agent", "key", "action"), (*together["s"], *together["a"]), strict=True):
             np.testing.assert_allclose(part[b].exp().numpy(), expected[name], atol=1e-9, rtol=0)
 
@@ -151,10 +151,10 @@ def test_marginals_equal_the_shares_of_two_million_episodes(expert):
         one = slice(number, number + 1)  # an episode, so that what is shown can happen
         states = np.stack([episodes.agent, episodes.key], axis=-1)[one, :10]
         window = window_of(states, episodes.action[one], episodes.reward[one].sum(axis=1))
-        visible = tabulate(text, tuple(FACTORS), 10).at(None).visible
-        shares, matches = count(episodes, ones, window, visible, 0)
+        shown = tabulate(text, tuple(FACTORS), 10).at(None).shown
+        shares, matches = count(episodes, ones, window, shown, 0)
         assert matches > 100, text
-        for name, exact in marginals(window, visible, expert=expert).items():
+        for name, exact in marginals(window, shown, expert=expert).items():
             error = np.sqrt((exact * (1 - exact)).clip(0) / matches)
             assert (np.abs(shares[name] - exact) <= 5 * error + 5 / matches).all(), (text, name)
             assert (shares[name][exact == 0] == 0).all(), (text, name)
@@ -178,7 +178,7 @@ def mask_of(text: str, t: int | None = None, B: int = 60) -> Mask:
 def test_what_is_hidden_changes_nothing(recorded):
     mask = mask_of("goal_conditioned", 4)
     hidden = {
-        name: torch.where(mask.visible[name].unsqueeze(-1), value, torch.nan) for name, value in recorded.values.items()
+        name: torch.where(mask.shown[name].unsqueeze(-1), value, torch.nan) for name, value in recorded.values.items()
     }
     before, after = Optimum()(recorded, mask), Optimum()(Window(hidden, recorded.valid), mask)
     assert all(torch.equal(p, q) for name in before for p, q in zip(before[name], after[name], strict=True))
@@ -243,7 +243,7 @@ def test_steps_past_the_episodes_end_are_not_seen(recorded):
         torch.arange(10).expand(20, 10) < 3,
     )
     mask = mask_of("a[:] | s[:2], rtg[0]", B=20).within(padded.valid)
-    one = Optimum(first_step=7)(short, showing({name: shown[:, :3] for name, shown in mask.visible.items()}))
+    one = Optimum(first_step=7)(short, showing({name: tokens[:, :3] for name, tokens in mask.shown.items()}))
     other = Optimum(first_step=7)(padded, mask)
     torch.testing.assert_close(one["a"][0], other["a"][0][:, :3])
 
@@ -260,13 +260,13 @@ def test_its_loss_is_the_entropy_in_expectation_and_no_answer_is_better():
     for text in TASKS:
         mask = TrainingMasks(text, tuple(FACTORS), 10)(window.valid, torch.arange(4000) * 10, seed=0, step=-1)
         exact = Optimum()(window, mask)
-        loss = sum(part.item() for part in masked_losses(exact, window, mask.predict, FACTORS).values())
-        expected = mean_over_asked(entropies(exact), mask.predict)
+        loss = sum(part.item() for part in masked_losses(exact, window, mask.asked, FACTORS).values())
+        expected = mean_over_asked(entropies(exact), mask.asked)
         assert math.isfinite(loss)
         assert loss == pytest.approx(expected, abs=0.05)
         softer = {name: [part.clamp_min(-8) / 2 for part in parts] for name, parts in exact.items()}
-        apart = mean_over_asked(divergences(exact, softer), mask.predict)
-        other = sum(part.item() for part in masked_losses(softer, window, mask.predict, FACTORS).values())
+        apart = mean_over_asked(divergences(exact, softer), mask.asked)
+        other = sum(part.item() for part in masked_losses(softer, window, mask.asked, FACTORS).values())
         assert apart > 0
         assert other - loss == pytest.approx(apart, abs=0.05)
 

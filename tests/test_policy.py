@@ -369,7 +369,7 @@ def test_answers_are_distributions_shown_values_come_back_and_hidden_ones_are_na
         window, mask = random_question(policy, batch_of(kind), seed)
         answer = policy.infer(window, mask)
         for name in ("s", "a"):
-            shown, asked = mask.visible[name], mask.predict[name]
+            shown, asked = mask.shown[name], mask.asked[name]
             best = answer.most_likely(name)
             assert torch.equal(best[shown], window.values[name][shown])
             assert best[asked].isfinite().all()
@@ -407,7 +407,7 @@ def test_hidden_values_and_the_future_change_no_answer(kind, layout, tiny_policy
     window = policy.make_window(batch_of(kind))
     answer = policy.infer(window, task, t=4)
     values = {
-        name: torch.where(answer.mask.visible[name].unsqueeze(-1), value, torch.nan)
+        name: torch.where(answer.mask.shown[name].unsqueeze(-1), value, torch.nan)
         for name, value in window.values.items()
     }
     assert_same_answers(policy.infer(Window(values, window.valid), task, t=4), answer)
@@ -418,7 +418,7 @@ def test_padding_is_neither_shown_nor_asked(tiny_policy, continuous_batch):
     answer = policy.infer(continuous_batch, "s[1:], a[1:] | s[0], a[0], s[-1]")
     valid = policy.make_window(continuous_batch).valid
     for name in ("s", "a"):
-        assert not (answer.mask.visible[name] & ~valid).any()
+        assert not (answer.mask.shown[name] & ~valid).any()
         assert torch.equal(answer.most_likely(name).isnan().all(-1), ~valid)
 
 
@@ -505,7 +505,7 @@ def test_samples_keep_what_is_shown_and_fill_what_is_asked(kind, layout, order, 
     drawn = policy.sample(window, mask, order=order, seed=4)
     again = policy.sample(window, mask, order=order, seed=4)
     for name in ("s", "a"):
-        shown, asked = mask.visible[name], mask.predict[name]
+        shown, asked = mask.shown[name], mask.asked[name]
         assert torch.equal(drawn.values[name][shown], window.values[name][shown])
         assert drawn.values[name][~shown & ~asked].isnan().all()
         assert torch.equal(drawn.values[name].nan_to_num(-99), again.values[name].nan_to_num(-99))
@@ -1135,7 +1135,7 @@ def test_both_directions_train_the_same_weights_and_answer_with_them(tiny_policy
     normalised = policy.statistics.normalise(window)
     for task, causal in (("behavior_cloning", True), ("goal_conditioned", False)):
         mask = policy._table(task).at(3, len(window.valid))
-        logits = policy.network(normalised, mask.visible, causal)["a"][0][:, 3]
+        logits = policy.network(normalised, mask.shown, causal)["a"][0][:, 3]
         answer = policy.infer(window, task, t=3)["a"][0].probabilities[:, 3]
         torch.testing.assert_close(answer, logits.softmax(-1))
 

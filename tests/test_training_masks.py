@@ -124,8 +124,8 @@ def test_training_masks_are_those_of_a_loop_over_windows(masks):
     drawn = TrainingMasks(masks, FACTORS, K)(valid, index, seed=7, step=3)
     for b in range(len(index)):
         shown, asked = slow_mask(masks, valid[b].tolist(), int(index[b]), 7, 3, FACTORS)
-        assert {(f, p) for f in FACTORS for p in drawn.visible[f][b].nonzero().flatten().tolist()} == shown
-        assert {(f, p) for f in FACTORS for p in drawn.predict[f][b].nonzero().flatten().tolist()} == asked
+        assert {(f, p) for f in FACTORS for p in drawn.shown[f][b].nonzero().flatten().tolist()} == shown
+        assert {(f, p) for f in FACTORS for p in drawn.asked[f][b].nonzero().flatten().tolist()} == asked
 
 
 @pytest.mark.parametrize("masks", MIXTURES)
@@ -133,12 +133,12 @@ def test_nothing_outside_the_episode_and_nothing_twice(masks):
     valid = ragged(2000, 10)
     mask = TrainingMasks(masks, FACTORS, 10)(valid, torch.arange(2000), seed=0, step=0)
     for name in FACTORS:
-        assert not (mask.visible[name] & ~valid).any()
-        assert not (mask.predict[name] & ~valid).any()
-        assert not (mask.visible[name] & mask.predict[name]).any()
-        assert mask.visible[name].dtype == torch.bool
-    assert not mask.predict["rtg"].any()
-    assert not mask.visible["rtg"][:, 1:].any()
+        assert not (mask.shown[name] & ~valid).any()
+        assert not (mask.asked[name] & ~valid).any()
+        assert not (mask.shown[name] & mask.asked[name]).any()
+        assert mask.shown[name].dtype == torch.bool
+    assert not mask.asked["rtg"].any()
+    assert not mask.shown["rtg"][:, 1:].any()
 
 
 @pytest.mark.parametrize("length", [1, 4, 10])
@@ -148,7 +148,7 @@ def test_t_is_uniform_among_the_steps_that_ask_for_something_valid(task, length)
     valid = (torch.arange(K) < length).expand(B, K)
     mask = TrainingMasks(task, FACTORS, K)(valid, torch.arange(B), seed=1, step=2)
     # How many actions are shown or asked tells these masks apart.
-    count = mask.predict["a"].sum(1) if task == "past" else mask.visible["a"].sum(1)
+    count = mask.asked["a"].sum(1) if task == "past" else mask.shown["a"].sum(1)
     if task == "past":
         # t = 1 .. K - 1, the valid ones of its asked steps 0 .. t - 1: every t at or past the end asks for all of them.
         observed = count.bincount(minlength=length + 1)[1:]
@@ -204,13 +204,13 @@ def test_random_masking_has_the_papers_marginals():
     B, K = 40_000, 3
     valid = torch.ones(B, K, dtype=torch.bool)
     mask = TrainingMasks(RANDOM_MASK, FACTORS, K)(valid, torch.arange(B), seed=3, step=8)
-    hidden = ~torch.cat([mask.visible["s"], mask.visible["a"]], dim=1)  # (B, 2 K)
-    assert torch.equal(hidden, torch.cat([mask.predict["s"], mask.predict["a"]], dim=1))
+    hidden = ~torch.cat([mask.shown["s"], mask.shown["a"]], dim=1)  # (B, 2 K)
+    assert torch.equal(hidden, torch.cat([mask.asked["s"], mask.asked["a"]], dim=1))
     # With p ~ U(0, 1), the number hidden is uniform on 0 .. 2 K, and given the number every choice is equally likely.
     assert_frequencies(hidden.sum(1).bincount(minlength=2 * K + 1), torch.ones(2 * K + 1))
     pairs = hidden[hidden.sum(1) == 2].long() @ 2 ** torch.arange(2 * K)
     assert_frequencies(torch.tensor(list(Counter(pairs.tolist()).values())), torch.ones(15))
-    shown = mask.visible["rtg"][:, 0]
+    shown = mask.shown["rtg"][:, 0]
     assert_frequencies([int(shown.sum()), int((~shown).sum())], [1, 1])
     # The return is shown or not whatever the rest.
     many = hidden.sum(1) > K
@@ -225,7 +225,7 @@ def test_a_mask_depends_on_seed_update_and_frame_alone(masks):
 
     def draw(rows, seed=5, step=11):
         mask = drawer(valid[rows], index[rows], seed=seed, step=step)
-        return torch.stack([*mask.visible.values(), *mask.predict.values()], dim=1)
+        return torch.stack([*mask.shown.values(), *mask.asked.values()], dim=1)
 
     every = torch.arange(100)
     whole = draw(every)
@@ -247,7 +247,7 @@ def test_the_global_generator_is_neither_used_nor_moved():
     assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(1)
     second = drawer(valid, index, seed=0, step=0)
-    assert all(torch.equal(first.visible[name], second.visible[name]) for name in FACTORS)
+    assert all(torch.equal(first.shown[name], second.shown[name]) for name in FACTORS)
 
 
 class CountOperations(TorchDispatchMode):
@@ -283,13 +283,13 @@ def causal_masks(masks, share=1.0, B=2000, K=4, factors=("s", "a", "rtg"), **set
 def test_a_causal_window_asks_a_question_at_every_step_at_once():
     _, mask = causal_masks("behavior_cloning", B=1)
     assert mask.causal.all()
-    assert mask.visible["s"].all()
-    assert mask.visible["a"][0].tolist() == [True] * 3 + [False]
-    assert mask.predict["a"].all()
-    assert not mask.predict["s"].any()
-    assert not mask.visible["rtg"].any()
+    assert mask.shown["s"].all()
+    assert mask.shown["a"][0].tolist() == [True] * 3 + [False]
+    assert mask.asked["a"].all()
+    assert not mask.asked["s"].any()
+    assert not mask.shown["rtg"].any()
     _, mask = causal_masks("reward_conditioned", B=1)
-    assert mask.visible["rtg"][0].tolist() == [True, False, False, False]
+    assert mask.shown["rtg"][0].tolist() == [True, False, False, False]
 
 
 def test_causality_keeps_the_steps_of_a_causal_window_apart():
@@ -301,29 +301,29 @@ def test_causality_keeps_the_steps_of_a_causal_window_apart():
         for row, t in enumerate(table.t.tolist()):
             before = {"s": t + 1, "a": t, "rtg": K}
             for f, name in enumerate(factors):
-                assert torch.equal(union.visible[name][0, : before[name]], table.visible[row, f, : before[name]])
-                assert not table.visible[row, f, before[name] :].any()
+                assert torch.equal(union.shown[name][0, : before[name]], table.shown[row, f, : before[name]])
+                assert not table.shown[row, f, before[name] :].any()
 
 
 def test_causal_random_masking_asks_for_every_token_and_shows_half_of_the_properties():
     _, mask = causal_masks("random_mask")
     for name in ("s", "a"):
-        assert mask.visible[name].all()
-        assert mask.predict[name][:, 1:].all()
-    assert mask.predict["a"][:, 0].all()
-    assert not mask.predict["s"][:, 0].any()
-    assert not mask.visible["rtg"][:, 1:].any()
-    assert mask.visible["rtg"][:, 0].float().mean().item() == pytest.approx(0.5, abs=5 * 0.5 / 2000**0.5)
+        assert mask.shown[name].all()
+        assert mask.asked[name][:, 1:].all()
+    assert mask.asked["a"][:, 0].all()
+    assert not mask.asked["s"][:, 0].any()
+    assert not mask.shown["rtg"][:, 1:].any()
+    assert mask.shown["rtg"][:, 0].float().mean().item() == pytest.approx(0.5, abs=5 * 0.5 / 2000**0.5)
 
 
 def test_the_share_of_causal_windows_is_as_asked_and_the_others_are_as_without():
     _, mask = causal_masks("multi_task", share=0.3)
     assert mask.causal.float().mean().item() == pytest.approx(0.3, abs=5 * (0.21 / 2000) ** 0.5)
     _, without = causal_masks("multi_task", share=0.0)
-    for name in mask.visible:
-        assert torch.equal(mask.visible[name][~mask.causal], without.visible[name][~mask.causal])
-        assert torch.equal(mask.predict[name][~mask.causal], without.predict[name][~mask.causal])
-    conditioned = mask.visible["rtg"][mask.causal][:, 0].float().mean().item()  # two of the tasks have a causal form
+    for name in mask.shown:
+        assert torch.equal(mask.shown[name][~mask.causal], without.shown[name][~mask.causal])
+        assert torch.equal(mask.asked[name][~mask.causal], without.asked[name][~mask.causal])
+    conditioned = mask.shown["rtg"][mask.causal][:, 0].float().mean().item()  # two of the tasks have a causal form
     assert conditioned == pytest.approx(0.5, abs=0.11)
 
 

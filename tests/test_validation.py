@@ -83,7 +83,7 @@ def test_a_loss_is_the_mean_surprise_at_the_asked_for_tokens(tiny_policy, batch,
             mask = draw(torch.ones(1, 10, dtype=torch.bool), one["index"], seed=0, step=VALIDATION_STEP)
             answer = policy.infer(one, mask)
             for name in ("s", "a"):
-                for step in mask.predict[name][0].nonzero().flatten().tolist():
+                for step in mask.asked[name][0].nonzero().flatten().tolist():
                     for d, part in enumerate(answer[name]):
                         category = int(truth[name][episode, step, d])
                         surprises.setdefault((name, d), []).append(-math.log(part.probabilities[0, step, category]))
@@ -93,12 +93,12 @@ def test_a_loss_is_the_mean_surprise_at_the_asked_for_tokens(tiny_policy, batch,
 
 def test_every_policy_gets_the_same_windows_and_masks(tiny_policy, batch) -> None:
     def asked_of(policy: UniMASKPolicy, masks) -> dict[str, list]:
-        """mask text -> all values and all visible tokens that the policy was given."""
+        """mask text -> all values and all shown tokens that the policy was given."""
         given = []
         predict = policy.predict
 
         def record(window, mask):
-            given.append((window, mask.visible))
+            given.append((window, mask.shown))
             return predict(window, mask)
 
         policy.predict = record
@@ -112,9 +112,9 @@ def test_every_policy_gets_the_same_windows_and_masks(tiny_policy, batch) -> Non
     torch.manual_seed(2)
     other = asked_of(trained, ALL[::-1])  # in another order too
     for text in ALL:
-        (window, visible), (other_window, other_visible) = one[text], other[text]
-        for name, shown in visible.items():
-            assert torch.equal(shown, other_visible[name])
+        (window, shown), (other_window, other_shown) = one[text], other[text]
+        for name in shown:
+            assert torch.equal(shown[name], other_shown[name])
             assert torch.equal(window.values[name], other_window.values[name])
 
 
@@ -132,7 +132,7 @@ def test_a_mask_asks_about_every_step_equally_often(tiny_policy, batch) -> None:
     policy = tiny_policy()
     draw = TrainingMasks("behavior_cloning", tuple(policy.factors), 10)
     mask: Mask = draw(torch.ones(3000, 10, dtype=torch.bool), torch.arange(3000) * 10, seed=0, step=VALIDATION_STEP)
-    assert mask.predict["a"].sum(0).sub(300).abs().max() < 4 * math.sqrt(300)
+    assert mask.asked["a"].sum(0).sub(300).abs().max() < 4 * math.sqrt(300)
 
 
 # --- Runs ------------------------------------------------------------------------------------------------------------

@@ -98,8 +98,8 @@ def answer(
     predictions = predict(statistics.normalise(window), mask, cache)
     distributions = {}
     for name, outputs in predictions.items():
-        shown = mask.visible[name].unsqueeze(-1)
-        known = shown | mask.predict[name].unsqueeze(-1)  # (B, K, 1)
+        shown = mask.shown[name].unsqueeze(-1)
+        known = shown | mask.asked[name].unsqueeze(-1)  # (B, K, 1)
         distributions[name] = []
         for output, component in zip(outputs, factors[name].components, strict=True):
             output = output.float()  # also under autocast, or probabilities would not sum to one

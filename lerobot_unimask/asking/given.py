@@ -97,14 +97,14 @@ def check_values(what: str, values: Tensor, factor: Factor) -> None:
                 )
 
 
-def check_shown(tokens: Iterable[tuple[str, int]], visible: Mapping[str, Tensor], text: str) -> None:
+def check_shown(tokens: Iterable[tuple[str, int]], shown: Mapping[str, Tensor], text: str) -> None:
     """A given token must be one that the mask shows, (..., K) bool for each factor, or giving it changes nothing.
 
     Raises:
         ValueError: the mask does not show it.
     """
     for name, step in tokens:
-        if not visible[name][..., step].any():
+        if not shown[name][..., step].any():
             raise ValueError(
                 f"{name}[{step}] is given, but the mask does not show it:\n  {text}\n"
                 f"Add {name}[{step}] after the bar, or do not give it."
@@ -119,7 +119,7 @@ def check_known(mask: Mask, known: Mapping[str, Tensor], text: str) -> None:
     """
     missing = [
         f"{name}[{step}]"
-        for name, shown in mask.visible.items()
+        for name, shown in mask.shown.items()
         for step in (shown.any(0).cpu() & ~known[name]).nonzero().flatten().tolist()
     ]
     if missing:

@@ -80,16 +80,18 @@ def sample(
         raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
     if tries < 1:
         raise ValueError(f"tries is {tries}; it must be at least 1.")
-    asked = torch.stack([mask.predict[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
+    asked = torch.stack([mask.asked[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
     tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
     if order == "backward":
         tokens.reverse()
     elif order == "random":
         shuffle = torch.randperm(len(tokens), generator=generator, device=generator.device).tolist()
         tokens = [tokens[i] for i in shuffle]
-    shown = {name: visible.unsqueeze(-1) for name, visible in mask.visible.items()}
-    samples = Samples({name: torch.where(shown[name], v, torch.nan) for name, v in window.values.items()}, window.valid)
-    if check is not None and not check(samples.values, mask.visible).all():
+    shown = {
+        name: torch.where(mask.shown[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()
+    }
+    samples = Samples(shown, window.valid)
+    if check is not None and not check(samples.values, mask.shown).all():
         raise ValueError(
             "By the check what is shown is impossible already, so no sample can pass: show something else."
         )
@@ -98,27 +100,27 @@ def sample(
         """Draw all tokens of some samples, (n,) their numbers, and return those that got stuck."""
         stuck = [rows[:0]]
         values = {name: value[rows] for name, value in samples.values.items()}
-        visible = {name: shown[rows] for name, shown in mask.visible.items()}
+        shown = {name: tokens[rows] for name, tokens in mask.shown.items()}
         for name, step in tokens:
-            here = torch.zeros_like(visible[name])
-            here[:, step] = mask.predict[name][rows, step]
-            nothing = {other: torch.zeros_like(here) for other in visible}
-            posed = Mask(visible, nothing | {name: here})
+            here = torch.zeros_like(shown[name])
+            here[:, step] = mask.asked[name][rows, step]
+            nothing = {other: torch.zeros_like(here) for other in shown}
+            posed = Mask(shown, nothing | {name: here})
             said = answer(predict, statistics, factors, Window(values, samples.valid[rows]), posed)
-            visible = visible | {name: visible[name] | here}
+            shown = shown | {name: shown[name] | here}
             redraw = here[:, step].nonzero().squeeze(-1)
             for _ in range(tries):
                 value = torch.cat([distribution.at(redraw, step).draw(generator) for distribution in said[name]], -1)
                 values[name][redraw, step] = value[:, 0]
                 samples.drawn += len(redraw)
-                redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(visible, redraw))]
+                redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(shown, redraw))]
                 samples.rejected += len(redraw)
                 if len(redraw) == 0:
                     break
             else:
                 going_on = torch.ones_like(rows, dtype=torch.bool).index_fill(0, redraw, False)
                 stuck.append(rows[~going_on])
-                values, visible, rows = _rows(values, going_on), _rows(visible, going_on), rows[going_on]
+                values, shown, rows = _rows(values, going_on), _rows(shown, going_on), rows[going_on]
         for name in ASKABLE:
             samples.values[name][rows] = values[name]
         return torch.cat(stuck)

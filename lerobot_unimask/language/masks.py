@@ -85,39 +85,39 @@ def parse(text: str) -> Question:
 class MaskTable:
     """Every mask that one question stands for: row r is the mask at t = `t[r]`.
 
-    `visible` and `predict` are (R, F, K) booleans, `t` is (R,) int64; a question without t has one row, with t = -1.
+    `shown` and `asked` are (R, F, K) booleans, `t` is (R,) int64; a question without t has one row, with t = -1.
     """
 
     question: Question
     factors: tuple[str, ...]
-    visible: Tensor
-    predict: Tensor
+    shown: Tensor
+    asked: Tensor
     t: Tensor
 
     @functools.cached_property
     def shows(self) -> dict[str, Tensor]:
         """factor -> (K,) bool: tokens shown by some row."""
-        return dict(zip(self.factors, self.visible.any(0), strict=True))
+        return dict(zip(self.factors, self.shown.any(0), strict=True))
 
     @functools.cached_property
     def shows_ahead(self) -> dict[str, Tensor]:
         """factor -> (K,) bool: tokens shown by some row before a rollout at its t can have observed them."""
-        steps, t = torch.arange(self.visible.shape[-1]), self.t[:, None]
+        steps, t = torch.arange(self.shown.shape[-1]), self.t[:, None]
         ahead = {"s": steps > t, "a": steps >= t}  # (R, K); a property is never observed
         always = torch.ones_like(steps > t)
-        return {name: (self.visible[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
+        return {name: (self.shown[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
 
     @functools.cached_property
     def acts(self) -> bool:
         """Whether there is a row for every step t of the window, and it asks for a[t]: a question for rollouts."""
-        steps = torch.arange(self.visible.shape[-1])
-        return torch.equal(self.t, steps) and bool(self.predict[steps, self.factors.index("a"), steps].all())
+        steps = torch.arange(self.shown.shape[-1])
+        return torch.equal(self.t, steps) and bool(self.asked[steps, self.factors.index("a"), steps].all())
 
     def masks(self) -> "Mask":
         """Every row as one batch of masks."""
         return Mask(
-            dict(zip(self.factors, self.visible.unbind(1), strict=True)),
-            dict(zip(self.factors, self.predict.unbind(1), strict=True)),
+            dict(zip(self.factors, self.shown.unbind(1), strict=True)),
+            dict(zip(self.factors, self.asked.unbind(1), strict=True)),
         )
 
     def at(self, t: int | None, batch_size: int = 1) -> "Mask":
@@ -139,10 +139,10 @@ class MaskTable:
             )
         else:
             row = self.t.tolist().index(int(t))
-        shape = (batch_size, self.visible.shape[-1])
+        shape = (batch_size, self.shown.shape[-1])
         return Mask(
-            {name: self.visible[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
-            {name: self.predict[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
+            {name: self.shown[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
+            {name: self.asked[row, f].expand(shape).clone() for f, name in enumerate(self.factors)},
         )
 
 
@@ -166,21 +166,21 @@ def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTa
             raise MaskError(f"{term.factor} can be shown but never asked; ask for s or a.", text, term.position)
     rows: list[tuple[int, Tensor, Tensor]] = []
     for t in range(context_length) if question.uses_t else (-1,):
-        predict = _select(question.asked, factors, context_length, t, text)
-        visible = _select(question.shown, factors, context_length, t, text)
-        if predict is None or visible is None:
+        asked = _select(question.asked, factors, context_length, t, text)
+        shown = _select(question.shown, factors, context_length, t, text)
+        if asked is None or shown is None:
             continue  # an integer index falls outside the window at this t
-        predict &= ~visible  # what is shown is not asked
-        if predict.any():
-            rows.append((t, visible, predict))
+        asked &= ~shown  # what is shown is not asked
+        if asked.any():
+            rows.append((t, shown, asked))
     if not rows:
         where = f" for any t in a window of {context_length} steps" if question.uses_t else ""
         raise MaskError(f"Nothing is asked that is not shown{where}.", text, question.asked[0].position)
     return MaskTable(
         question,
         tuple(factors),
-        visible=torch.stack([visible for _, visible, _ in rows]),
-        predict=torch.stack([predict for _, _, predict in rows]),
+        shown=torch.stack([shown for _, shown, _ in rows]),
+        asked=torch.stack([asked for _, _, asked in rows]),
         t=torch.tensor([t for t, _, _ in rows]),
     )
 
@@ -234,7 +234,7 @@ def _bound(index: Index | None, K: int, t: int) -> int | None:
 class Mask:
     """Which tokens of a batch of windows the model may see and which it is asked for.
 
-    Two dicts of factor -> (B, K) bool; True in `visible` means shown, True in `predict` means asked. Goal-conditioned
+    Two dicts of factor -> (B, K) bool; `shown` and `asked`. Goal-conditioned
     imitation at t = 2 in a window of six steps, `#` shown, `?` asked, `.` neither:
 
         s ###..#  a ##?...
@@ -243,27 +243,27 @@ class Mask:
     in the order properties, s0, a0, s1, a1, ...; so one window may show a token to those after it and ask for it too.
     """
 
-    visible: dict[str, Tensor]
-    predict: dict[str, Tensor]
+    shown: dict[str, Tensor]
+    asked: dict[str, Tensor]
     causal: Tensor | bool = False
 
     def within(self, valid: Tensor) -> "Mask":
         """The same mask with steps outside the episode, `valid` (B, K) False, neither shown nor asked."""
-        visible = {name: shown & valid for name, shown in self.visible.items()}
-        predict = {name: asked & valid for name, asked in self.predict.items()}
-        return Mask(visible, predict, self.causal)
+        shown = {name: tokens & valid for name, tokens in self.shown.items()}
+        asked = {name: tokens & valid for name, tokens in self.asked.items()}
+        return Mask(shown, asked, self.causal)
 
     def repeat(self, times: int) -> "Mask":
         """Each window's mask `times` times, one after another."""
-        visible = {name: shown.repeat_interleave(times, dim=0) for name, shown in self.visible.items()}
-        predict = {name: asked.repeat_interleave(times, dim=0) for name, asked in self.predict.items()}
+        shown = {name: tokens.repeat_interleave(times, dim=0) for name, tokens in self.shown.items()}
+        asked = {name: tokens.repeat_interleave(times, dim=0) for name, tokens in self.asked.items()}
         causal = self.causal if isinstance(self.causal, bool) else self.causal.repeat_interleave(times, dim=0)
-        return Mask(visible, predict, causal)
+        return Mask(shown, asked, causal)
 
     def to(self, device: torch.device) -> "Mask":
         return Mask(
-            {name: shown.to(device) for name, shown in self.visible.items()},
-            {name: asked.to(device) for name, asked in self.predict.items()},
+            {name: tokens.to(device) for name, tokens in self.shown.items()},
+            {name: tokens.to(device) for name, tokens in self.asked.items()},
             self.causal if isinstance(self.causal, bool) else self.causal.to(device),
         )
 
@@ -271,8 +271,7 @@ class Mask:
         """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and
         action before it and none after; properties may be shown or not."""
         shown, asked = (
-            torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1)
-            for tokens in (self.visible, self.predict)
+            torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1) for tokens in (self.shown, self.asked)
         )  # (B, 2 K), in the order of time
         order = torch.arange(shown.shape[1], device=shown.device)
         count = shown.sum(1, keepdim=True)
@@ -282,7 +281,7 @@ class Mask:
     def draw(self, window: int = 0) -> str:
         """One window's mask as text, in the notation of the class's docstring."""
         rows = []
-        for name, shown in self.visible.items():
-            marks = zip(shown[window].tolist(), self.predict[name][window].tolist(), strict=True)
+        for name, shown in self.shown.items():
+            marks = zip(shown[window].tolist(), self.asked[name][window].tolist(), strict=True)
             rows.append(f"{name} " + "".join("#" if s else "?" if p else "." for s, p in marks))
         return "  ".join(rows)

@@ -56,8 +56,8 @@ class TrainingMasks(nn.Module):
         empty = torch.zeros(0, len(self.factors), context_length, dtype=torch.bool)
         weights = torch.tensor(list(self.weights.values()), dtype=torch.float64)
         # Worked out from the config, so not part of the checkpoint.
-        self._keep("visible", torch.cat([empty, *(table.visible for table in tables.values())]))
-        self._keep("predict", torch.cat([empty, *(table.predict for table in tables.values())]))
+        self._keep("shown", torch.cat([empty, *(table.shown for table in tables.values())]))
+        self._keep("asked", torch.cat([empty, *(table.asked for table in tables.values())]))
         self._keep("task_of_row", torch.tensor([tasks[text] for text in tables for _ in tables[text].t]).long())
         self._keep("askable", torch.tensor([name in ASKABLE for name in self.factors])[:, None])  # (F, 1)
         self._keep("cumulative_weights", _cumulative(weights))
@@ -74,9 +74,9 @@ class TrainingMasks(nn.Module):
         self.causal_share = causal_share if capable.any() else 0.0
         self.causal_draw = causal_draw
         nothing = (empty.new_zeros(empty.shape[1:]),) * 2
-        visible, predict = zip(*(form or nothing for form in forms), strict=True)
-        self._keep("causal_visible", torch.stack(visible))  # (T, F, K) for each of the tasks
-        self._keep("causal_predict", torch.stack(predict))
+        shown, asked = zip(*(form or nothing for form in forms), strict=True)
+        self._keep("causal_shown", torch.stack(shown))  # (T, F, K) for each of the tasks
+        self._keep("causal_asked", torch.stack(asked))
         self._keep("causal_row", capable[self.task_of_row])
         self._keep("causal_cumulative_weights", _cumulative(weights * capable) if capable.any() else torch.zeros(0))
 
@@ -86,16 +86,16 @@ class TrainingMasks(nn.Module):
     def _causal_form(self, table: MaskTable | None, K: int) -> tuple[Tensor, Tensor] | None:
         """What a causal window of this task, None for random masking, shows and asks for: two (F, K), or None."""
         if table is None:
-            visible = torch.ones(len(self.factors), K, dtype=torch.bool)
-            predict = self.askable.repeat(1, K)
-            predict[self.factors.index("s"), 0] = False  # nothing of the window comes before it
-            visible[[f for f, name in enumerate(self.factors) if name not in ASKABLE], 1:] = False
-            return visible, predict
+            shown = torch.ones(len(self.factors), K, dtype=torch.bool)
+            asked = self.askable.repeat(1, K)
+            asked[self.factors.index("s"), 0] = False  # nothing of the window comes before it
+            shown[[f for f, name in enumerate(self.factors) if name not in ASKABLE], 1:] = False
+            return shown, asked
         mask = table.masks()
         following = mask.next_tokens()
-        if any((following[name] != mask.predict[name]).any() for name in ASKABLE):
+        if any((following[name] != mask.asked[name]).any() for name in ASKABLE):
             return None
-        return table.visible.any(0), table.predict.any(0)
+        return table.shown.any(0), table.asked.any(0)
 
     def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
         """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
@@ -104,10 +104,10 @@ class TrainingMasks(nn.Module):
         if self.causal_share > 0 and self.random_task is not None:
             return following
         learnt = self.causal_row & (self.causal_share > 0)  # (R,)
-        visible = torch.stack([mask.visible[name] for name in self.factors], dim=1)  # (B, F, K)
-        same = (visible[:, None] == self.visible).all((2, 3)) & learnt  # (B, R)
+        shown = torch.stack([mask.shown[name] for name in self.factors], dim=1)  # (B, F, K)
+        same = (shown[:, None] == self.shown).all((2, 3)) & learnt  # (B, R)
         return {
-            name: tokens & (same.float() @ self.predict[:, self.factors.index(name)].float() > 0)
+            name: tokens & (same.float() @ self.asked[:, self.factors.index(name)].float() > 0)
             for name, tokens in following.items()
         }
 
@@ -124,26 +124,26 @@ class TrainingMasks(nn.Module):
         F = len(self.factors)
         uniform = counter_uniform(seed, step, index, 4 + F * K)  # (B, 4 + F K)
         task = torch.searchsorted(self.cumulative_weights, uniform[:, 0].contiguous(), right=True)  # (B,)
-        visible = valid.new_zeros(B, F, K)
-        predict = valid.new_zeros(B, F, K)
-        if len(self.visible):
-            visible, predict = self._question_masks(valid, task, uniform[:, 1])
+        shown = valid.new_zeros(B, F, K)
+        asked = valid.new_zeros(B, F, K)
+        if len(self.shown):
+            shown, asked = self._question_masks(valid, task, uniform[:, 1])
         hidden = self._hidden(uniform[:, 2], uniform[:, 3:-1].view(B, F, K))
         if self.random_task is not None:
             chosen = (task == self.random_task)[:, None, None]
-            visible = torch.where(chosen, ~hidden, visible)
-            predict = torch.where(chosen, hidden & self.askable, predict)
+            shown = torch.where(chosen, ~hidden, shown)
+            asked = torch.where(chosen, hidden & self.askable, asked)
         causal: Tensor | bool = False
         if self.causal_share > 0:
             causal = self._draw_causal(uniform[:, -1], seed, step)  # (B,)
             task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
-            shown = self.causal_visible[task]
+            history = self.causal_shown[task]
             if self.random_task is not None:
-                shown = shown & (self.askable | ~hidden | (task != self.random_task)[:, None, None])
-            visible = torch.where(causal[:, None, None], shown, visible)
-            predict = torch.where(causal[:, None, None], self.causal_predict[task], predict)
-        visible, predict = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (visible, predict))
-        return Mask(visible, predict, causal).within(valid)
+                history = history & (self.askable | ~hidden | (task != self.random_task)[:, None, None])
+            shown = torch.where(causal[:, None, None], history, shown)
+            asked = torch.where(causal[:, None, None], self.causal_asked[task], asked)
+        shown, asked = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (shown, asked))
+        return Mask(shown, asked, causal).within(valid)
 
     def _draw_causal(self, uniform: Tensor, seed: int, step: Tensor | int) -> Tensor:
         """(B,) bool, which windows are causal."""
@@ -154,13 +154,13 @@ class TrainingMasks(nn.Module):
 
     def _question_masks(self, valid: Tensor, task: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """One row per window, uniform among those of its task that ask for something valid: two (B, F, K)."""
-        asked = self.predict.any(1)  # (R, K)
+        asked = self.asked.any(1)  # (R, K)
         admissible = (valid.float() @ asked.T.float() > 0) & (self.task_of_row == task[:, None])  # (B, R)
         rank = admissible.cumsum(1)
         wanted = (uniform * rank[:, -1]).floor() + 1  # 1 .. number of admissible rows
         row = (admissible & (rank == wanted[:, None])).int().argmax(1)  # (B,)
         some = admissible.any(1)[:, None, None]
-        return self.visible[row] & some, self.predict[row] & some
+        return self.shown[row] & some, self.asked[row] & some
 
     def _hidden(self, probability: Tensor, uniform: Tensor) -> Tensor:
         """Random masking (paper, section 2.2 and appendix C): p ~ U(0, 1) per window, each state and action hidden

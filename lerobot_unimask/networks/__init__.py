@@ -1,4 +1,4 @@
-"""The networks: (window, visible) -> predictions, one file each, chosen by `--policy.network=...`."""
+"""The networks: (window, shown) -> predictions, one file each, chosen by `--policy.network=...`."""
 
 from typing import TYPE_CHECKING
 

@@ -12,7 +12,7 @@ from lerobot_unimask.networks.transformer import Transformer
 
 
 class DecisionGPT(Transformer):
-    """(window, visible) -> predictions: the transformer with causal attention alone, one token per factor and step.
+    """(window, shown) -> predictions: the transformer with causal attention alone, one token per factor and step.
 
     The return token, with its timestep, comes first; positions count within the window; a window carries all t of a
     question at once, so every step's action is supervised, each from its state's token.
@@ -27,7 +27,7 @@ class DecisionGPT(Transformer):
         super().__init__(factors, stacked=False, **settings)
 
     def forward(
-        self, window: Window, visible: dict[str, Tensor], causal: Tensor | bool = True, cache: Cache | None = None
+        self, window: Window, shown: dict[str, Tensor], causal: Tensor | bool = True, cache: Cache | None = None
     ) -> Predictions:
         """As `Transformer.forward`, causally whatever `causal` says."""
-        return super().forward(window, visible, True, cache)
+        return super().forward(window, shown, True, cache)

@@ -17,7 +17,7 @@ TIMESTEPS = 1000
 
 
 class DecisionTransformer(nn.Module):
-    """(window, visible) -> predictions: a causal transformer over return-to-go, state and action of every step.
+    """(window, shown) -> predictions: a causal transformer over return-to-go, state and action of every step.
 
     A mask shows the return at a window's first step or not at all. Where it does, this network alone reads the later
     steps' too: recorded ones in training, in a rollout the first lowered by the rewards received since. At step t it
@@ -73,15 +73,15 @@ class DecisionTransformer(nn.Module):
         self.register_buffer("before", before, persistent=False)
 
     def forward(
-        self, window: Window, visible: dict[str, Tensor], causal: Tensor | bool = True, cache: Cache | None = None
+        self, window: Window, shown: dict[str, Tensor], causal: Tensor | bool = True, cache: Cache | None = None
     ) -> Predictions:
         """As `Transformer.forward`, causally whatever `causal` says; it keeps nothing in a cache.
 
         Raises:
             ValueError: the first return is shown and a later one, at a step whose state is shown, is not known.
         """
-        tokens = [self._embed_returns(window, visible)]
-        tokens += [embed(window.values[name], visible[name]) for name, embed in self.embeddings.items()]
+        tokens = [self._embed_returns(window, shown)]
+        tokens += [embed(window.values[name], shown[name]) for name, embed in self.embeddings.items()]
         timestep = (window.values["rtg"][..., -1] * TIMESTEPS).round().long().clamp(0, TIMESTEPS)  # (B, K)
         x = torch.stack(tokens, dim=2) + self.timesteps(timestep).unsqueeze(2)  # (B, K, 3, W)
         x = self.dropout(self.norm_inputs(x.flatten(1, 2)))  # (B, 3 K, W): R0 s0 a0 R1 s1 a1 ...
@@ -91,16 +91,16 @@ class DecisionTransformer(nn.Module):
         # Each is predicted from the token before it; before s0 there is none.
         return self.heads({"s": functional.pad(at_action, (0, 0, 1, -1)), "a": at_state})
 
-    def _embed_returns(self, window: Window, visible: dict[str, Tensor]) -> Tensor:
+    def _embed_returns(self, window: Window, shown: dict[str, Tensor]) -> Tensor:
         """(B, K, W)"""
         returns = window.values["rtg"][..., :1]  # (B, K, 1)
-        shown = visible["rtg"][:, :1]  # (B, 1): of all steps, or none
+        conditioned = shown["rtg"][:, :1]  # (B, 1): of all steps, or none
         known = returns[..., 0].isfinite()
-        if (shown & visible["s"] & ~known).any():
+        if (conditioned & shown["s"] & ~known).any():
             raise ValueError(
                 "A Decision Transformer reads the return-to-go of every step, and this window has that of its first "
                 "alone. Ask about a recorded window, or in a rollout whose environment reports "
                 "'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
             )
-        read = (shown & known).unsqueeze(-1)
+        read = (conditioned & known).unsqueeze(-1)
         return torch.where(read, self.returns(torch.where(read, returns, 0.0)), self.hidden_return)

@@ -15,7 +15,7 @@ from lerobot_unimask.networks.layers import Cache, FactorEmbedding, Heads, Predi
 
 
 class FeedForward(nn.Module):
-    """(window, visible) -> predictions: every token embedded, hidden ones too, all of them end to end, then an MLP.
+    """(window, shown) -> predictions: every token embedded, hidden ones too, all of them end to end, then an MLP.
 
     Note: The paper gives the sizes (embeddings of 32, three hidden layers of 128) and the masks, "the same maskings as
         our transformer", and no more. Here a hidden token is a learned embedding, as in the transformer, which tells
@@ -56,10 +56,10 @@ class FeedForward(nn.Module):
         self.heads = Heads(factors, feedforward_width, steps=context_length)
 
     def forward(
-        self, window: Window, visible: dict[str, Tensor], causal: Tensor | bool = False, cache: Cache | None = None
+        self, window: Window, shown: dict[str, Tensor], causal: Tensor | bool = False, cache: Cache | None = None
     ) -> Predictions:
         """As `Transformer.forward`; it sees the whole window whatever `causal` says, and keeps nothing in a cache."""
-        tokens = {name: embed(window.values[name], visible[name]) for name, embed in self.embeddings.items()}
+        tokens = {name: embed(window.values[name], shown[name]) for name, embed in self.embeddings.items()}
         x = torch.cat(
             [token.flatten(1) if name in ASKABLE else token[:, 0] for name, token in tokens.items()], dim=1
         )  # (B, N W)

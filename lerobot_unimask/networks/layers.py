@@ -40,12 +40,12 @@ class NumberEncoding(nn.Module):
         self.register_buffer("scales", 4.0 ** torch.arange(4), persistent=False)
         self.size = size * (1 + 2 * 4 + 4) + 1 if fine else size
 
-    def forward(self, value: Tensor, visible: Tensor) -> Tensor:
+    def forward(self, value: Tensor, shown: Tensor) -> Tensor:
         """(B, K, d), 0 where hidden, and (B, K) -> (B, K, size)"""
         if not self.fine:
             return value
-        previous = _previous_shown(visible)
-        both = (visible & (previous >= 0)).unsqueeze(-1)
+        previous = _previous_shown(shown)
+        both = (shown & (previous >= 0)).unsqueeze(-1)
         gap = torch.arange(value.shape[1], device=value.device) - previous
         displacement = torch.where(both, (value - _at(value, previous)) / gap.unsqueeze(-1), 0.0)
         scaled = torch.tanh(displacement.unsqueeze(-1) * self.scales).flatten(2)
@@ -53,7 +53,7 @@ class NumberEncoding(nn.Module):
         return torch.cat([value, angles.sin(), angles.cos(), scaled, both.to(value.dtype)], dim=-1)
 
 
-def course(value: Tensor, visible: Tensor, causal: Tensor | bool) -> Tensor:
+def course(value: Tensor, shown: Tensor, causal: Tensor | bool) -> Tensor:
     """Where values would be on the straight course through those shown nearest: between one before and one after, on
     from the last two before, or back from the first two after; 0 where nothing is shown.
 
@@ -62,19 +62,19 @@ def course(value: Tensor, visible: Tensor, causal: Tensor | bool) -> Tensor:
 
     Args:
         value: (B, K, d), 0 where hidden.
-        visible: (B, K)
+        shown: (B, K)
         causal: for all or each window, (B,): only what is before counts.
 
     Returns:
         (B, K, d)
     """
     steps = torch.arange(value.shape[1], device=value.device)
-    before = _previous_shown(visible)
+    before = _previous_shown(shown)
     onwards = _extrapolate(value, before)
     if causal is True:
         return onwards
-    after = value.shape[1] - 1 - _previous_shown(visible.flip(1)).flip(1)  # K: nothing after
-    backwards = _extrapolate(value.flip(1), _previous_shown(visible.flip(1))).flip(1)
+    after = value.shape[1] - 1 - _previous_shown(shown.flip(1)).flip(1)  # K: nothing after
+    backwards = _extrapolate(value.flip(1), _previous_shown(shown.flip(1))).flip(1)
     share = ((steps - before) / (after - before)).unsqueeze(-1)
     between = torch.lerp(_at(value, before), _at(value, after), share)
     any_before, any_after = (before >= 0).unsqueeze(-1), (after < len(steps)).unsqueeze(-1)
@@ -82,10 +82,10 @@ def course(value: Tensor, visible: Tensor, causal: Tensor | bool) -> Tensor:
     return both_ways if causal is False else torch.where(causal[:, None, None], onwards, both_ways)
 
 
-def _previous_shown(visible: Tensor) -> Tensor:
+def _previous_shown(shown: Tensor) -> Tensor:
     """(B, K) -> (B, K): the last shown step before each, -1 where there is none."""
-    steps = torch.arange(visible.shape[1], device=visible.device)
-    return functional.pad(torch.where(visible, steps, -1).cummax(1).values, (1, -1), value=-1)
+    steps = torch.arange(shown.shape[1], device=shown.device)
+    return functional.pad(torch.where(shown, steps, -1).cummax(1).values, (1, -1), value=-1)
 
 
 def _at(value: Tensor, step: Tensor) -> Tensor:
@@ -117,16 +117,16 @@ class FactorEmbedding(nn.Module):
         # Small, or in a stacked token what is hidden would drown what is shown, and learning takes twice as long.
         self.hidden = nn.Parameter(0.02 * torch.randn(width))
 
-    def forward(self, value: Tensor, visible: Tensor) -> Tensor:
+    def forward(self, value: Tensor, shown: Tensor) -> Tensor:
         """(B, K, D) and (B, K) -> (B, K, W)"""
-        shown = visible.unsqueeze(-1)
+        here = shown.unsqueeze(-1)
         # Replaced before it is embedded, so that not even a NaN in a hidden place can reach the network.
-        value = torch.where(shown, value, 0.0)
+        value = torch.where(here, value, 0.0)
         parts = [table(value[..., i].long()) for i, table in zip(self.discrete, self.categories, strict=True)]
         if self.continuous:
             numbers = torch.cat([value[..., dims] for dims in self.continuous], dim=-1)
-            parts.append(self.numbers(self.encoding(numbers, visible)))
-        return torch.where(shown, torch.stack(parts).sum(0), self.hidden)
+            parts.append(self.numbers(self.encoding(numbers, shown)))
+        return torch.where(here, torch.stack(parts).sum(0), self.hidden)
 
 
 class Heads(nn.ModuleDict):

@@ -50,7 +50,7 @@ def token_count(asked: Tensor) -> Tensor:
 
 
 def masked_losses(
-    predictions: dict[str, list[Tensor]], window: Window, predict: dict[str, Tensor], factors: dict[str, Factor]
+    predictions: dict[str, list[Tensor]], window: Window, asked: dict[str, Tensor], factors: dict[str, Factor]
 ) -> dict[str, Tensor]:
     """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up. With several
     processes it is this process's part in the mean over all their tokens, see `token_count`.
@@ -58,19 +58,19 @@ def masked_losses(
     Args:
         predictions: factor -> one (B, K, size) per component, as a network puts them out.
         window: the recorded values, normalised.
-        predict: factor -> (B, K) bool, True = asked for; never a step outside the episode.
+        asked: factor -> (B, K) bool, True = asked for; never a step outside the episode.
 
     Returns:
         factor -> scalar; 0 where nothing of the factor is asked.
     """
     losses = {}
     for name, outputs in predictions.items():
-        asked = predict[name]
+        here = asked[name]
         # Replaced where not asked: past the end of an episode anything may stand, even no number at all.
-        value = torch.where(asked.unsqueeze(-1), window.values[name], 0.0)
-        count = token_count(asked)
+        value = torch.where(here.unsqueeze(-1), window.values[name], 0.0)
+        count = token_count(here)
         losses[name] = sum(
-            (component_loss(output, value, component) * asked).sum() / count
+            (component_loss(output, value, component) * here).sum() / count
             for output, component in zip(outputs, factors[name].components, strict=True)
         )
     return losses

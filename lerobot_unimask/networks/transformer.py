@@ -18,7 +18,7 @@ from lerobot_unimask.networks.layers import Block, Cache, FactorEmbedding, Heads
 
 
 class Transformer(nn.Module):
-    """(window, visible) -> predictions.
+    """(window, shown) -> predictions.
 
     Args:
         factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
@@ -63,7 +63,7 @@ class Transformer(nn.Module):
     def forward(
         self,
         window: Window,
-        visible: dict[str, Tensor],
+        shown: dict[str, Tensor],
         causal: Tensor | bool = False,
         cache: Cache | None = None,
     ) -> Predictions:
@@ -72,24 +72,24 @@ class Transformer(nn.Module):
 
         Args:
             window: normalised values.
-            visible: factor -> (B, K) bool, True = shown.
+            shown: factor -> (B, K) bool, True = shown.
             causal: whether tokens see only those before them, for all windows or each, (B,) bool. The prediction for a
                 token is then made from the one before it, and does not depend on whether itself is shown.
             cache: of a rollout, with `causal=True`: only what it does not hold yet is computed, up to the last token
                 shown; only the prediction for the next one means something.
         """
-        tokens = {name: embed(window.values[name], visible[name]) for name, embed in self.embeddings.items()}
+        tokens = {name: embed(window.values[name], shown[name]) for name, embed in self.embeddings.items()}
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
         x = self.dropout(x + self.positions)
-        x = self._attend(x, causal) if cache is None else self._extend(x, self._count(visible), cache)
+        x = self._attend(x, causal) if cache is None else self._extend(x, self._count(shown), cache)
         x = self.norm(x)
         if causal is not False:  # the token before; nothing stands before the first one
             before = functional.pad(x, (0, 0, 1, -1))
             x = before if causal is True else torch.where(causal[:, None, None], before, x)
         predictions = self.heads(dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x))
         if self.on_course:
-            states = torch.where(visible["s"].unsqueeze(-1), window.values["s"], 0.0)
-            ahead = course(states, visible["s"], causal)
+            states = torch.where(shown["s"].unsqueeze(-1), window.values["s"], 0.0)
+            ahead = course(states, shown["s"], causal)
             for i, dims in self.on_course.items():
                 output = predictions["s"][i]
                 mean = output[..., : dims.stop - dims.start] + ahead[..., dims]
@@ -121,9 +121,9 @@ class Transformer(nn.Module):
         cache.inputs = x[:, :count]
         return functional.pad(new, (0, 0, count - 1, x.shape[1] - count))
 
-    def _count(self, visible: dict[str, Tensor]) -> int:
+    def _count(self, shown: dict[str, Tensor]) -> int:
         """Tokens up to the last state or action that is shown in some window."""
-        steps = torch.stack([visible[name].any(0) for name in ASKABLE], dim=1).flatten()  # (2 K,)
+        steps = torch.stack([shown[name].any(0) for name in ASKABLE], dim=1).flatten()  # (2 K,)
         shown = steps.nonzero()
         return len(self.properties) + (int(shown[-1]) + 1 if len(shown) else 0)
 

@@ -172,7 +172,7 @@ def optimum_losses(config: HeatmapConfig) -> dict[str, float]:
     losses = {}
     for task in TASKS:
         mask = TrainingMasks(task, tuple(FEATURES), K)(window.valid, batch["index"], seed=0, step=VALIDATION_STEP)
-        losses[task] = mean_over_asked(entropies(optimum(window, mask)), mask.predict)
+        losses[task] = mean_over_asked(entropies(optimum(window, mask)), mask.asked)
     return losses
 
 

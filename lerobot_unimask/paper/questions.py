@@ -245,23 +245,23 @@ def consistency(policy: UniMASKPolicy, batch: dict[str, Tensor], *, seed: int) -
     window = policy.make_window(batch, partial=True)
     draw = TrainingMasks(RANDOM_MASK, tuple(policy.factors), policy.config.context_length).to(policy.device)
     mask = draw(window.valid, batch["index"].to(policy.device), seed=seed, step=0)
-    for name, shown in mask.visible.items():
-        mask.visible[name] = shown & ~window.values[name].isnan().any(-1)  # the data may lack a property
-    asked = torch.stack([mask.predict[name] for name in ("s", "a")], dim=-1).flatten(1)  # (N, 2 K)
+    for name, tokens in mask.shown.items():
+        mask.shown[name] = tokens & ~window.values[name].isnan().any(-1)  # the data may lack a property
+    asked = torch.stack([mask.asked[name] for name in ("s", "a")], dim=-1).flatten(1)  # (N, 2 K)
     some = asked.any(1)
     generator = torch.Generator(asked.device).manual_seed(seed)
     one = torch.multinomial(asked.float() + ~some[:, None], 1, generator=generator)
     alone = torch.zeros_like(asked).scatter(1, one, True) & asked
     states, actions = alone.unflatten(1, (-1, 2)).unbind(-1)
-    alone = Mask(mask.visible, mask.predict | {"s": states, "a": actions})
+    alone = Mask(mask.shown, mask.asked | {"s": states, "a": actions})
     answers = policy.infer(window, mask), policy.infer(window, alone)
     sums, differences, changed = [], [], 0
     for name in ("s", "a"):
         for among, single in zip(answers[0][name], answers[1][name], strict=True):
-            sums.append((among.probabilities[mask.predict[name]].sum(-1) - 1).abs().max())
-            here = alone.predict[name]
+            sums.append((among.probabilities[mask.asked[name]].sum(-1) - 1).abs().max())
+            here = alone.asked[name]
             differences.append((among.probabilities[here] - single.probabilities[here]).abs().max())
-        shown = mask.visible[name]
+        shown = mask.shown[name]
         changed += int((answers[0].most_likely(name)[shown] != window.values[name][shown]).sum())
     return {
         "masks": len(asked),

@@ -39,9 +39,9 @@ def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
         mask: Of any questions and factors.
         window: Which of the mask's windows.
     """
-    names = list(mask.visible)
-    shown = np.stack([mask.visible[name][window].numpy(force=True) for name in names])  # (F, K)
-    asked = np.stack([mask.predict[name][window].numpy(force=True) for name in names])
+    names = list(mask.shown)
+    shown = np.stack([mask.shown[name][window].numpy(force=True) for name in names])  # (F, K)
+    asked = np.stack([mask.asked[name][window].numpy(force=True) for name in names])
     F, K = shown.shape
     figure = Figure(figsize=(min(WIDTH, 1.5 + 0.42 * K), 0.9 + 0.42 * F), layout="constrained")
     axes = figure.subplots()
@@ -76,7 +76,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
         window: Which of the answer's windows.
     """
     rows = [(name, distribution) for name in answer.distributions for distribution in answer[name]]
-    rows = [(name, d) for name, d in rows if answer.mask.predict[name][window].any()]
+    rows = [(name, d) for name, d in rows if answer.mask.asked[name][window].any()]
     heights = [0.5 + 0.13 * min(d.component.categories or 12, 20) for _, d in rows]
     figure = Figure(figsize=(WIDTH, 0.9 + sum(heights)), layout="constrained")
     grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
@@ -86,14 +86,14 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
         if truth is not None:
             recorded = truth.values[name][window, :, distribution.component.dims].numpy(force=True)  # (K, d)
             recorded = np.where(truth.valid[window].numpy(force=True)[:, None], recorded, np.nan)
-        shown = answer.mask.visible[name][window].numpy(force=True)  # (K,)
+        shown = answer.mask.shown[name][window].numpy(force=True)  # (K,)
         if distribution.probabilities is not None:
             _draw_heat_map(axes, distribution, recorded, shown, probability, window)
         else:
             _draw_bands(axes, distribution, recorded, shown, window)
         axes.set_ylabel(f"{name}: {distribution.name}", fontsize=SMALL + 1)
         axes.tick_params(labelsize=SMALL)
-    K = answer.mask.visible["s"].shape[1]
+    K = answer.mask.shown["s"].shape[1]
     grid[-1].set(xlim=(-0.5, K - 0.5), xlabel="step", xticks=range(0, K, max(1, K // 20)))
     if any(d.probabilities is not None for _, d in rows):
         colorbar = figure.colorbar(probability, ax=list(grid), shrink=0.8, aspect=25, pad=0.01)

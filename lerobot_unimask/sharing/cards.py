@@ -121,10 +121,10 @@ def _random_example(factors: tuple[str, ...], K: int) -> Mask:
     draws = TrainingMasks(RANDOM_MASK, factors, K)(
         torch.ones(windows, K, dtype=torch.bool), torch.arange(windows), seed=0, step=0
     )
-    hidden = torch.cat(list(draws.predict.values()), dim=1).sum(1)  # (64,)
+    hidden = torch.cat(list(draws.asked.values()), dim=1).sum(1)  # (64,)
     best = int((hidden - K).abs().argmin())
     return Mask(
-        *({name: tokens[best : best + 1] for name, tokens in part.items()} for part in (draws.visible, draws.predict))
+        *({name: tokens[best : best + 1] for name, tokens in part.items()} for part in (draws.shown, draws.asked))
     )
 
 

@@ -90,11 +90,11 @@ class Optimum:
         B, K = window.valid.shape
         device = window.valid.device
         values = {name: value.cpu() for name, value in window.values.items()}
-        visible = {name: shown.cpu() for name, shown in mask.visible.items()}
+        shown = {name: tokens.cpu() for name, tokens in mask.shown.items()}
         parts = []
         for first in range(0, B, _CHUNK):
             chunk = slice(first, first + _CHUNK)
-            these = ({name: tensor[chunk] for name, tensor in part.items()} for part in (values, visible))
+            these = ({name: tensor[chunk] for name, tensor in part.items()} for part in (values, shown))
             parts.append(self._marginals(*these, K, first))
         agent, key, action = (
             torch.cat(part).log().clamp_min(_LOG_ZERO).to(device) for part in zip(*parts, strict=True)
@@ -102,12 +102,12 @@ class Optimum:
         return {"s": [agent, key], "a": [action]}
 
     def _marginals(
-        self, values: dict[str, Tensor], visible: dict[str, Tensor], K: int, first_window: int
+        self, values: dict[str, Tensor], shown: dict[str, Tensor], K: int, first_window: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Probabilities of the agent's cell (B, K, 16), the key's cell (B, K, 16) and the action (B, K, 4)."""
         steps = HORIZON - self.first_step  # to the end of the episode; what follows the window is not seen
-        seen_state, seen_action = self._evidence(values, visible, K, steps)  # (B, T, S), (B, T, A)
-        first, last = self._return_evidence(values, visible)  # (1, C, S), (B, C, S)
+        seen_state, seen_action = self._evidence(values, shown, K, steps)  # (B, T, S), (B, T, A)
+        first, last = self._return_evidence(values, shown)  # (1, C, S), (B, C, S)
         B = len(last)
 
         # Backward: ahead[k], (B, C, S), the probability of all that is seen from step k on, given the state there.
@@ -140,32 +140,32 @@ class Optimum:
         return agent, key, action
 
     def _evidence(
-        self, values: dict[str, Tensor], visible: dict[str, Tensor], K: int, steps: int
+        self, values: dict[str, Tensor], shown: dict[str, Tensor], K: int, steps: int
     ) -> tuple[Tensor, Tensor]:
         """Which states, (B, T, S), and actions, (B, T, A), agree with what is shown at each step of the episode."""
-        B = len(visible["s"])
+        B = len(shown["s"])
         state = torch.ones(B, steps, len(self.seen), dtype=torch.float64)
         action = torch.ones(B, steps, len(ACTIONS), dtype=torch.float64)
         within = min(K, steps)
         agrees = (values["s"][:, :within, None] == self.seen).all(-1)  # (B, T, S)
-        state[:, :within] = (agrees | ~visible["s"][:, :within, None]).double()
+        state[:, :within] = (agrees | ~shown["s"][:, :within, None]).double()
         agrees = values["a"][:, :within] == torch.arange(len(ACTIONS))  # (B, T, A)
-        action[:, :within] = (agrees | ~visible["a"][:, :within, None]).double()
+        action[:, :within] = (agrees | ~shown["a"][:, :within, None]).double()
         return state, action
 
-    def _return_evidence(self, values: dict[str, Tensor], visible: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _return_evidence(self, values: dict[str, Tensor], shown: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Which first states (1, C, S) belong to each case, and which last states (B, C, S) give the shown return."""
-        B, S = len(visible["s"]), len(self.seen)
-        shown = visible["rtg"][:, 0] if "rtg" in visible else torch.zeros(B, dtype=torch.bool)
-        if not shown.any():
+        B, S = len(shown["s"]), len(self.seen)
+        conditioned = shown["rtg"][:, 0] if "rtg" in shown else torch.zeros(B, dtype=torch.bool)
+        if not conditioned.any():
             return torch.ones(1, 1, S, dtype=torch.float64), torch.ones(B, 1, S, dtype=torch.float64)
-        returns, timestep = torch.where(shown[:, None], values["rtg"][:, 0], 0.0).unbind(-1)  # (B,)
-        if ((timestep * HORIZON - self.first_step).abs()[shown] > 1e-3).any():
+        returns, timestep = torch.where(conditioned[:, None], values["rtg"][:, 0], 0.0).unbind(-1)  # (B,)
+        if ((timestep * HORIZON - self.first_step).abs()[conditioned] > 1e-3).any():
             raise ValueError(f"A shown return is not one at step {self.first_step}, where these windows start.")
         distances = self.distance[self.start > 0].unique()  # (C,)
         first = self.distance == distances[:, None]  # (C, S)
         gives = distances[:, None] - self.distance == returns[:, None, None]  # (B, C, S)
-        return first[None].double(), (gives | ~shown[:, None, None]).double()
+        return first[None].double(), (gives | ~conditioned[:, None, None]).double()
 
     def _choices(self, ahead: Tensor, seen_action: Tensor) -> Tensor:
         """(B, C, S) of the next step and (B, A) -> (B, C, S, A), action by action what comes of it."""
@@ -225,11 +225,9 @@ def entropies(exact: Predictions) -> dict[str, list[Tensor]]:
     return {name: [_cross_entropy(p, p) for p in parts] for name, parts in exact.items()}
 
 
-def mean_over_asked(costs: dict[str, list[Tensor]], predict: dict[str, Tensor]) -> float:
+def mean_over_asked(costs: dict[str, list[Tensor]], asked: dict[str, Tensor]) -> float:
     """Each component's mean over the asked-for tokens, added up: how `masked_losses` adds up its own costs."""
-    return sum(
-        cost[predict[name]].mean().item() for name, parts in costs.items() for cost in parts if predict[name].any()
-    )
+    return sum(cost[asked[name]].mean().item() for name, parts in costs.items() for cost in parts if asked[name].any())
 
 
 def random_mask_divergence(
@@ -253,10 +251,10 @@ def random_mask_divergence(
     for number in range(draws):
         mask = draw(window.valid, index, seed=0, step=VALIDATION_STEP - number)
         apart = divergences(optimum(window, mask), predict(normalised, mask, None))
-        hidden = torch.cat([mask.predict["s"], mask.predict["a"]], dim=1).double().mean(1)  # (B,)
+        hidden = torch.cat([mask.asked["s"], mask.asked["a"]], dim=1).double().mean(1)  # (B,)
         for name, i, label in kinds:
-            found[label].append(apart[name][i][mask.predict[name]])
-            shares[label].append(hidden[:, None].expand_as(mask.predict[name])[mask.predict[name]])
+            found[label].append(apart[name][i][mask.asked[name]])
+            shares[label].append(hidden[:, None].expand_as(mask.asked[name])[mask.asked[name]])
     return {label: _by_share(torch.cat(found[label]), torch.cat(shares[label])) for label in found}
 
 

@@ -233,7 +233,7 @@ def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
         ValueError: The answer says nothing about some steps.
     """
     agent, key = (distribution.probabilities[window].numpy(force=True) for distribution in answer["s"])  # (K, 16) each
-    shown = answer.mask.visible["s"][window].tolist()
+    shown = answer.mask.shown["s"][window].tolist()
     silent = np.flatnonzero(np.isnan(agent).any(axis=1)).tolist()
     if silent:
         neither = ", ".join(f"s[{at}]" for at in silent)

@@ -43,7 +43,7 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
     state = answer["s"][0]
     mean = state.mean[window].numpy(force=True)  # (K, 4): x, y, goal x, goal y
     scale = None if state.scale is None else state.scale[window].numpy(force=True)
-    shown = answer.mask.visible["s"][window].numpy(force=True)  # (K,)
+    shown = answer.mask.shown["s"][window].numpy(force=True)  # (K,)
     recorded = None if truth is None else truth.values["s"][window][truth.valid[window]].numpy(force=True)
     goal = mean[~np.isnan(mean[:, 2])][0, 2:] if recorded is None else recorded[0, 2:]
     figure = Figure(figsize=(WIDTH, 4.4), layout="constrained")
