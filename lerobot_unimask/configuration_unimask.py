@@ -1,13 +1,17 @@
 """The policy's one config dataclass, `--policy.type=unimask`."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from draccus import decode
-from draccus.utils import DecodingError
+from draccus.utils import DecodingError, ParsingError
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
@@ -21,19 +25,19 @@ from lerobot_unimask.data.factors import (
     read_feature,
 )
 from lerobot_unimask.language.grammar import MAX_CONTEXT
-from lerobot_unimask.language.masks import RANDOM_MASK, parse
+from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK, parse
 from lerobot_unimask.language.training_masks import mixture
+from lerobot_unimask.records import read_json
 
 # Each network with the ways in which it can attend, its default first
 NETWORKS = {
     "transformer": ("both", "bidirectional", "causal"),
     "feedforward": ("bidirectional",),
-    "decision_gpt": ("causal",),
     "decision_transformer": ("causal",),
 }
-CAUSAL_DRAWS = ("window", "update")
 TOKEN_LAYOUTS = ("stacked", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
+MAX_SIZE = 65536  # of a layer: more is a damaged file, or a slip
 
 
 class FormatVersion(int):
@@ -41,7 +45,7 @@ class FormatVersion(int):
     fields that a newer format has and this code does not know."""
 
 
-FORMAT_VERSION = FormatVersion(1)  # of a checkpoint's files; it grows when older code would misread them
+FORMAT_VERSION = FormatVersion(2)  # of a checkpoint's files; it grows when older code would misread them
 
 
 @decode.register(FormatVersion)
@@ -54,7 +58,13 @@ def _read_format(value: Any, path: Sequence[str] = ()) -> FormatVersion:
             f"This checkpoint has format {value}; lerobot_policy_unimask {version('lerobot_policy_unimask')} reads "
             f"formats up to {FORMAT_VERSION}: upgrade it, with `pip install -U lerobot_policy_unimask`.",
         )
-    return FORMAT_VERSION  # what will be saved
+    if value == 1:
+        raise DecodingError(
+            path,
+            "This checkpoint has format 1. UniMASKPolicy.from_pretrained(FOLDER) reads it, and "
+            ".save_pretrained(FOLDER) then saves it in today's format.",
+        )
+    return FORMAT_VERSION
 
 
 @PreTrainedConfig.register_subclass("unimask")
@@ -69,83 +79,113 @@ class UniMASKConfig(PreTrainedConfig):
 
     # The window
     context_length: int = 10
-    # K: steps that the model sees at once.
+    """K: steps that the model sees at once."""
     drop_n_last_frames: int | None = None
-    # Frames at the end of an episode that start no training window; None: K - 1, which keeps to full windows.
+    """Frames at the end of an episode that start no training window; None: K - 1, which keeps to full windows."""
 
     # The questions
     training_masks: list[str] | dict[str, float] | str = RANDOM_MASK
-    # What is trained on: one mask text or task name, a list, or a mapping to weights.
+    """What is trained on: one mask text or task name, a list, or a mapping to weights."""
     mask_seed: int = 0
-    # Training masks are a function of this seed, the update count and the frame's index.
+    """Training masks are a function of this seed, the update count and the frame's index."""
     inference_mask: str = "behavior_cloning"
-    # The question that acting asks at every step; it must ask for a[t].
+    """The question that acting asks at every step; it must ask for a[t]."""
     target_return: float | str | None = None
-    # The return to ask for from an episode's first step on, shown as rtg[0] where the inference mask shows it; "auto":
-    # that of the training episode whose first state is nearest, times target_return_scale.
+    """Return to ask for from an episode's first step on, shown as rtg[0] where the inference mask shows it;
+    "auto": that of the training episode whose first state is nearest, times target_return_scale."""
     target_return_scale: float = 1.1
-    # The paper asks for a tenth more than the nearest episode returned.
+    """Factor of the nearest episode's return, with target_return=auto; the paper asks for a tenth more."""
     given: dict[str, list[list[float] | float] | float] = field(default_factory=dict)
-    # Values of single tokens in a rollout's window, {"s[-1]": [15, 15]}, in the dataset's units.
+    """Values of single tokens in a rollout, in the dataset's units: of a position in the window, {"s[-1]": [15, 15]},
+    or of a step of the episode, {"s@150": [15, 15]}."""
     sample_actions: bool = False
-    # Act by sampling from the answer instead of taking its most likely action.
+    """Whether acting draws from the answer instead of taking its most likely action."""
+    n_obs_steps: int | None = None
+    """Steps that acting remembers, at most K; None: K. A setting of acting, not of training."""
+    chunk_size: int = 1
+    """H: actions that acting asks for at once, from the present on. H - 1 steps of the window then lie ahead of the
+    present, for as long as the episode lasts."""
+    n_action_steps: int = 1
+    """Actions of a chunk that are carried out before acting asks again, at most H."""
 
     # The network
     network: str = "transformer"
-    # Or one of the paper's other architectures: "feedforward", "decision_gpt", "decision_transformer".
+    """Architecture: "transformer", or one of the paper's others, "feedforward" and "decision_transformer"."""
     attention: str | None = None
-    # "both": training windows are read causally or in both directions, and so are questions: causally where they ask
-    # for the next token given all before it, as acting does. "bidirectional" is the paper's, "causal" acts alone. None:
-    # the network's own way, which is "both" for the transformer.
+    """How a window is read. "both": training windows are read causally or in both directions, and so are questions:
+    causally where they ask for the next token given all before it, as acting does. "bidirectional" is the paper's,
+    "causal" acts alone. None: the network's own way, which is "both" for the transformer."""
     causal_share: float = 0.5
-    # With attention=both, the share of training windows that are read causally.
-    causal_draw: str = "window"
-    # "window": each draws whether it is read causally; "update": a batch's windows draw it together.
+    """Share of the training windows that are read causally, with attention=both."""
     token_layout: str = "separate"
-    # "separate": one token per factor and step; "stacked", the paper's: one token per step, made of all its factors.
+    """Tokens of a step. "separate": one for each factor; "stacked", the paper's: one, made of all its factors."""
     fine_inputs: bool = True
-    # Continuous values come with displacements, sines and cosines, and states are predicted as departures from the
-    # straight course of those shown; False: the plain numbers, as in the paper.
+    """Whether continuous values are read with displacements, sines and cosines; False: as plain numbers, the paper's.
+    """
+    state_residuals: bool = True
+    """Whether continuous states are predicted as departures from the straight course of those shown; False: as plain
+    values, the paper's."""
     continuous_head: str = "gaussian"
-    # What is predicted of continuous values: "gaussian", a mean and a scale, or "l2", the paper's: a mean by the
-    # squared error, which hardly notices what is nearly certain, such as states some steps ahead.
+    """What is predicted of continuous values: "gaussian", a mean and a scale, or "l2", the paper's: a mean by the
+    squared error, which hardly notices what is nearly certain, such as states some steps ahead."""
     width: int = 128
+    """Numbers that stand for a token inside the network."""
     depth: int = 3
+    """Number of blocks, or of the perceptron's hidden layers."""
     heads: int = 8
+    """Attention heads of a block; they divide the width."""
     feedforward_width: int = 512
+    """Width of the layer inside a block, or of the perceptron's hidden layers."""
     dropout: float = 0.1
+    """Share of a layer's outputs that training leaves out."""
 
     # The loss
     loss_weights: dict[str, float] = field(default_factory=dict)
-    # Weight of each factor's loss, {"s": 0.5}; 1 where not named.
+    """Weight of each factor's loss, {"s": 0.5}; 1 where not named."""
 
     # The optimiser's preset
     optimizer_lr: float = 1e-3
+    """Learning rate of AdamW, at its highest."""
     optimizer_weight_decay: float = 0.01
+    """Weight decay of AdamW."""
     optimizer_grad_clip_norm: float = 1.0
+    """Norm to which gradients are clipped."""
     scheduler_warmup_steps: int = 200
+    """Updates in which the learning rate rises; then it falls along a cosine."""
 
     # The data
     properties: list[str] = field(default_factory=list)
-    # Columns that label whole episodes, observation.NAME: each is a factor NAME, shown as NAME[0] or not at all.
+    """Columns that label whole episodes, observation.NAME: each is a factor NAME, shown as NAME[0] or not at all."""
 
     # Read off the training dataset and saved, so that a checkpoint knows what it was trained on.
     features: dict[str, list[Feature]] = field(default_factory=dict)
-    # Factor name -> the dataset's columns that make it up.
+    """Factor name -> the dataset's columns that make it up."""
     dataset_revision: str | None = None
-    # The commit on the Hub that the training data are of; None: they were read from a folder.
+    """Commit on the Hub that the training data are of; None: they were read from a folder."""
     format_version: FormatVersion = FORMAT_VERSION
-    # Of the files of a checkpoint.
+    """Format of a checkpoint's files."""
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
     )
-    # LeRobot's processors leave the numbers alone: the policy normalises, with statistics that it keeps itself.
+    """LeRobot's processors leave the numbers alone: the policy normalises, with statistics that it keeps itself."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= self.context_length <= MAX_CONTEXT:
             raise ValueError(f"context_length is {self.context_length}; it must lie in 1 to {MAX_CONTEXT} steps.")
+        if not 1 <= self.chunk_size <= self.context_length:
+            raise ValueError(
+                f"chunk_size is {self.chunk_size}; it must lie in 1 to context_length, {self.context_length}."
+            )
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps is {self.n_action_steps}; it must lie in 1 to chunk_size, {self.chunk_size}."
+            )
+        if self.n_obs_steps is not None and not 1 <= self.n_obs_steps <= self.context_length:
+            raise ValueError(
+                f"n_obs_steps is {self.n_obs_steps}; it must lie in 1 to context_length, {self.context_length}."
+            )
         if self.drop_n_last_frames is None:
             self.drop_n_last_frames = self.context_length - 1
         if self.network not in NETWORKS:
@@ -154,7 +194,6 @@ class UniMASKConfig(PreTrainedConfig):
             self.attention = NETWORKS[self.network][0]
         for name, choices in {
             "attention": NETWORKS[self.network],
-            "causal_draw": CAUSAL_DRAWS,
             "token_layout": TOKEN_LAYOUTS,
             "continuous_head": CONTINUOUS_HEADS,
         }.items():
@@ -172,8 +211,8 @@ class UniMASKConfig(PreTrainedConfig):
                 "attention=bidirectional or causal."
             )
         for name in ("width", "depth", "heads", "feedforward_width"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+            if not 1 <= getattr(self, name) <= MAX_SIZE:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1 to {MAX_SIZE}.")
         if self.width % self.heads:
             raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
         if not 0 <= self.dropout < 1:
@@ -182,6 +221,11 @@ class UniMASKConfig(PreTrainedConfig):
             raise ValueError(f"target_return is {self.target_return!r}; give a number or auto.")
         if isinstance(self.target_return, float) and not math.isfinite(self.target_return):
             raise ValueError(f"target_return is {self.target_return}; give a finite number or auto.")
+        for name, weight in self.loss_weights.items():
+            if name not in ASKABLE:
+                raise ValueError(f"loss_weights names {name}; only {' and '.join(ASKABLE)} are predicted.")
+            if not 0 <= weight < float("inf"):
+                raise ValueError(f"loss_weights gives {name} the weight {weight}; weights are numbers from 0 on.")
         # Syntax alone: which factors exist is known once the dataset or the checkpoint has been read.
         for text in mixture(self.training_masks):
             if text != RANDOM_MASK:
@@ -239,3 +283,39 @@ class UniMASKConfig(PreTrainedConfig):
             self.features = group_features(
                 {key: declared_feature(key, feature) for key, feature in sizes.items()}, self.properties
             )
+
+
+def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
+    """A config.json of format 1 as one of today's format, which answers the same."""
+    content = {name: value for name, value in content.items() if name != "causal_draw"}
+    content["state_residuals"] = content.get("fine_inputs", True)
+    content["format_version"] = int(FORMAT_VERSION)
+    if content.get("network") == "decision_gpt":
+        content |= {"network": "transformer", "attention": "causal", "token_layout": "separate"}
+    return content
+
+
+def read_config(folder: Path) -> UniMASKConfig:
+    """A checkpoint's config.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is not one of this policy. Says what is wrong; LeRobot's parser hides that behind its own words.
+    """
+    path = folder / CONFIG_NAME
+    if not path.exists():
+        raise FileNotFoundError(f"{folder} holds no checkpoint: there is no {CONFIG_NAME} in it.")
+    content = read_json(path)
+    kind = content.get("type") if isinstance(content, dict) else None
+    if kind != UniMASKConfig.get_choice_name(UniMASKConfig):
+        raise ValueError(f"{folder} is a policy of type {kind!r}, not of type 'unimask'.")
+    try:
+        if content.get("format_version") != 1:
+            return PreTrainedConfig.from_pretrained(folder)
+        with TemporaryDirectory() as upgraded:
+            (Path(upgraded) / CONFIG_NAME).write_text(json.dumps(_upgraded(content)))
+            return PreTrainedConfig.from_pretrained(upgraded)
+    except (ParsingError, ValueError, AttributeError) as error:
+        hidden = isinstance(error, ParsingError) and not isinstance(error, DecodingError)
+        reason = error.__cause__ if hidden else error
+        raise ValueError(f"{path} cannot be read: {reason}") from error

@@ -6,10 +6,8 @@ is in its JSON.
 """
 
 import dataclasses
-import importlib.metadata
 import json
 import os
-import platform
 import shlex
 import subprocess
 import sys
@@ -25,6 +23,7 @@ from lerobot_unimask.envs.doorkey.panels import five_panels, predicted_states
 from lerobot_unimask.envs.doorkey.pictures import draw_panels, state_distributions
 from lerobot_unimask.language.masks import TASKS
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.records import versions, write_json
 from lerobot_unimask.validation import task_losses
 
 EPISODES = 20_000
@@ -100,12 +99,9 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
         "loss_on_unseen_episodes": losses,
         "panels": [dataclasses.asdict(panel) for panel in panels],
         "state_distributions": _states(answer),
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in ("torch", "lerobot", "lerobot_policy_unimask")},
-        },
+        "versions": versions(),
     }
-    (output / "demo.json").write_text(json.dumps(record, indent=2) + "\n")
+    write_json(output / "demo.json", record, say=False)
     _close(output, checkpoint, record["seconds"])
     return record
 

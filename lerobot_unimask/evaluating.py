@@ -1,4 +1,4 @@
-"""Return against updates: every checkpoint of a run, rolled out with LeRobot's own evaluation."""
+"""A loop of rollouts: what lerobot-eval does with one checkpoint, in this process."""
 
 import math
 import time
@@ -14,7 +14,7 @@ from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.random_utils import set_seed
 
 
-def rollouts(
+def rollout(
     checkpoint: Path, env_type: str, episodes: int, *, batch_size: int, seed: int, **settings: Any
 ) -> dict[str, Any]:
     """What lerobot-eval does with one checkpoint, videos apart.

@@ -6,33 +6,32 @@ Legend of shapes: B windows, K steps, D the dimensions of a state.
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_unimask.asking.answers import answer as answer_question
-from lerobot_unimask.data.episodes import bounds_of, open_dataset, read_windows
+from lerobot_unimask.data.episodes import bounds_of, read_windows
 from lerobot_unimask.data.factors import RETURN_SO_FAR, Component
-from lerobot_unimask.language.masks import Mask
+from lerobot_unimask.language.masks import Mask, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
 EVERY = 7  # steps between the windows that are read
 
 
-def unseen_windows(policy: UniMASKPolicy, root: Path, episodes: Sequence[int]) -> dict[str, Tensor]:
+def unseen_windows(dataset: LeRobotDataset, context_length: int, episodes: Sequence[int]) -> dict[str, Tensor]:
     """Full windows of some episodes, one every few steps, as one LeRobot batch.
 
     Raises:
         ValueError: no episode is as long as a window.
     """
-    K = policy.config.context_length
-    dataset = open_dataset(policy.config, root)
+    K = context_length
     bounds = bounds_of(dataset)
     starts = [start for e in episodes for start in range(bounds[e][0], bounds[e][1] - K + 1, EVERY)]
     if not starts:
-        raise ValueError(f"None of these episodes of {root} has the {K} steps of a window.")
+        raise ValueError(f"None of these episodes of {dataset.root} has the {K} steps of a window.")
     return read_windows(dataset, starts)
 
 
@@ -70,11 +69,11 @@ def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     policy.eval()
     recorded = policy.make_window(batch)
     actions = recorded.values["a"]  # (B, K, D)
-    table = policy._table(question)
+    table = tabulate(question, tuple(policy.factors), policy.config.context_length)
     errors = []
     for t in table.t.tolist():
         mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
-        answer = answer_question(policy.predict, policy.statistics, policy.factors, recorded, mask)
+        answer = answer_question(policy, recorded, mask)
         error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.a_std
         errors.append(error[mask.asked["a"][:, t]].square().flatten())
     return torch.cat(errors).mean().item()
@@ -86,7 +85,7 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     over all windows and steps t, components added up. An L2 head counts as a Gaussian of the data's scale."""
     policy.eval()
     window = policy.statistics.normalise(policy.make_window(batch))
-    table = policy._table(question)
+    table = tabulate(question, tuple(policy.factors), policy.config.context_length)
     found = []
     for t in table.t.tolist():
         mask: Mask = table.at(t, len(window.valid)).to(policy.device).within(window.valid)
@@ -137,10 +136,15 @@ def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> d
     return {"median_ms": median, "quartiles_ms": [low, high], "environments": environments}
 
 
-def measure(policy: UniMASKPolicy, root: Path, episodes: Sequence[int], *, ahead: int) -> dict[str, Any]:
+def measure(policy: UniMASKPolicy, dataset: LeRobotDataset, episodes: Sequence[int], *, ahead: int) -> dict[str, Any]:
     """A JSON record of all that applies to this policy, over windows of episodes that it was not trained on."""
-    batch = unseen_windows(policy, root, episodes)
-    record: dict[str, Any] = {"windows": len(batch["index"]), "episodes": len(episodes)}
+    batch = unseen_windows(dataset, policy.config.context_length, episodes)
+    record: dict[str, Any] = {
+        "what": "action_error: mean squared, in standard deviations of the data; ahead: mean distance, in the "
+        "dataset's units; disagreement: nats; latency: milliseconds",
+        "windows": len(batch["index"]),
+        "episodes": len(episodes),
+    }
     questions = ["behavior_cloning"] + ["reward_conditioned"] * ("rtg" in policy.factors)
     if not any(component.discrete for component in policy.factors["a"].components):
         record["action_error"] = {question: action_error(policy, batch, question) for question in questions}

@@ -5,8 +5,6 @@ Everything that decides the answer is in the record, so that somebody else can a
 Legend of shapes: K steps of the window; there is one window.
 """
 
-import contextlib
-import io
 import json
 import math
 import re
@@ -20,65 +18,18 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.answers import Answer, ContinuousDistribution
 from lerobot_unimask.asking.given import Given
+from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples
-from lerobot_unimask.data.checkpoints import checkpoints_of
 from lerobot_unimask.data.episodes import episode_numbers, provenance_of, read_window
 from lerobot_unimask.data.window import Window
-from lerobot_unimask.envs.doorkey.expert import Expert
-from lerobot_unimask.envs.doorkey.optimum import check_features, exact_answer
-from lerobot_unimask.envs.doorkey.pictures import state_distributions, trajectories
-from lerobot_unimask.envs.doorkey.rules import DynamicsCheck
-from lerobot_unimask.envs.maze2d.pictures import maze_trajectories
+from lerobot_unimask.envs import environment_of_states
+from lerobot_unimask.envs.record import Environment, check_expert
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import ASKABLE, TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.plots.answers import distributions, marginals
-from lerobot_unimask.sharing import hub
-
-CHECKS = ("dynamics", "agreement")
-
-DOORKEY, MAZE2D = ["agent_cell", "key_cell"], ["x", "y", "goal_x", "goal_y"]  # by the names of their states' numbers
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A policy and where it came from.
-
-    path: a checkpoint's folder or a Hub repository.
-    revision: the commit hash of the latter, None of the former.
-    """
-
-    policy: UniMASKPolicy
-    path: str
-    revision: str | None
-
-
-def load_policy(path: str, revision: str | None = None) -> Loaded:
-    """Load a checkpoint: its folder, a lerobot-train output folder (its last one), or a Hub repository.
-
-    Args:
-        revision: of a Hub repository: a branch, tag or commit.
-
-    Raises:
-        FileNotFoundError: a folder that is neither.
-        HubError: a repository that cannot be had.
-        ValueError: it is another kind of policy.
-    """
-    local = Path(path).is_dir()
-    folder = checkpoints_of(Path(path))[-1] if local else hub.fetch(path, revision=revision)
-    kind = json.loads((folder / "config.json").read_text()).get("type")
-    if kind != "unimask":
-        raise ValueError(f"{path} is a policy of type {kind!r}; this command asks policies of type 'unimask'.")
-    with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
-        policy = UniMASKPolicy.from_pretrained(folder)
-    return Loaded(policy, str(folder) if local else path, hub.commit_of(folder))
-
-
-def maze_of(dataset: LeRobotDataset) -> str:
-    """The maze, a name or text, that a Maze2D dataset was built in."""
-    return provenance_of(Path(dataset.root)).get("maze", "medium")
 
 
 def given_from_episodes(
@@ -99,7 +50,10 @@ def given_from_episodes(
     windows = [policy.make_window(read_window(dataset, number), partial=True) for number in numbers]
     rows = {}
     for text in re.findall(r"[^,\[]+\[[^\]]*\]", tokens) or [tokens]:
-        name, step = parse_token(text.strip(), tuple(policy.factors), policy.config.context_length)
+        token = parse_token(text.strip(), tuple(policy.factors), policy.config.context_length)
+        if token.of_episode:
+            raise ValueError(f"{token} is a moment of the episode; name a token of its first window, as s[3].")
+        name, step = token.factor, token.step
         factor = policy.factors[name]
         values = torch.stack([window.values[name][0, step, : factor.given_size] for window in windows])
         short = [number for number, window in zip(numbers, windows, strict=True) if not window.valid[0, step]]
@@ -122,9 +76,28 @@ class Sampling:
 
 
 @dataclass(frozen=True)
+class Source:
+    """The recorded window that a question is about.
+
+    Attributes:
+        folder: place of the dataset on this machine.
+        root: folder that the user named, if one.
+        repo_id: name that the user gave, if one.
+        episode: number of the episode.
+        start: step of the episode that the window begins at.
+    """
+
+    folder: Path
+    root: Path | None
+    repo_id: str | None
+    episode: int
+    start: int
+
+
+@dataclass(frozen=True)
 class Reply:
-    """What came of a question: marginals, or samples where those were asked for; what was recorded; and DoorKey's exact
-    marginals, where those were asked for too."""
+    """What came of a question: marginals, or samples where those were asked for; what was recorded; and the exact
+    optimum's marginals, where those were asked for too."""
 
     mask: Mask
     answer: Answer | Samples
@@ -137,72 +110,72 @@ def ask(
     mask: str,
     *,
     batch: Mapping[str, Tensor] | None = None,
+    source: Source | None = None,
     t: int | None = None,
     given: Given | None = None,
     sampling: Sampling | None = None,
-    start: int = 0,
-    exact: Expert | None = None,
+    exact: str | None = None,
 ) -> Reply:
     """Put one question to a policy.
 
     Args:
         batch: one recorded window, as `read_window` gives it; None where everything shown is in `given`.
-        start: the episode's step that the window begins at, of which a check and the optimum know.
-        exact: DoorKey's expert whose data it is, to put the question to the exact optimum too.
+        source: place where it was recorded, of which a check and the optimum know.
+        exact: name of the expert whose data it is, to put the question to the exact optimum too.
 
     Raises:
-        MaskError, ValueError: as `UniMASKPolicy.infer` and `sample`; values are given for several windows; or the
-            optimum is of another environment, or finds what is shown impossible.
+        MaskError, ValueError: as `UniMASKPolicy.infer` and `sample`; values are given for several windows; or there is
+            no such check or optimum, or the optimum finds what is shown impossible.
     """
     recorded = None if batch is None else policy.make_window(batch, partial=True)
-    question = tabulate(mask, tuple(policy.factors), policy.config.context_length).at(t)
-    posed = question.to(policy.device)
+    start = source.start if source else 0
+    question = tabulate(mask, tuple(policy.factors), policy.config.context_length).at(t).to(policy.device)
     if recorded is not None:
-        posed = posed.within(recorded.valid)
-        if not any(asked.any() for asked in posed.asked.values()):
+        question = question.within(recorded.valid)
+        if not any(asked.any() for asked in question.asked.values()):
             raise ValueError(
                 f"The episode ends before what is asked: of the window's {policy.config.context_length} steps it has "
                 f"{int(recorded.valid.sum())}. Start earlier or ask for an earlier step."
             )
+    answer: Answer | Samples
     if sampling is None:
         answer = policy.infer(recorded, mask, t=t, given=given)
         windows = len(answer.mask.shown["s"])
     else:
-        answer = policy.sample(
-            recorded,
-            mask,
-            t=t,
-            given=given,
-            samples=sampling.samples,
-            order=sampling.order,
-            seed=sampling.seed,
-            check=make_check(policy, sampling.check, start),
-        )
+        check = make_check(policy, sampling.check, start) if sampling.check else None
+        settings = {"samples": sampling.samples, "order": sampling.order, "seed": sampling.seed, "check": check}
+        answer = policy.sample(recorded, mask, t=t, given=given, **settings)
         windows = len(answer.valid) // sampling.samples
     if windows > 1:
         raise ValueError(f"Values for {windows} windows are given; give one value for each token.")
     best = None
     if exact is not None:
-        check_features(policy.config.features)
-        window, shown = policy.pose(recorded, mask, t, given)
+        environment = _environment(policy)
+        check_expert(environment, exact, provenance_of(source.folder) if source else {})
+        window, shown = pose_question(policy, recorded, mask, t, given)
         cpu = torch.device("cpu")
-        best = exact_answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
-    return Reply(posed, answer, recorded, best)
+        best = environment.exact_answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
+    return Reply(question, answer, recorded, best)
 
 
-def make_check(policy: UniMASKPolicy, name: str | None, start: int = 0) -> Check | None:
-    """A check by name: `dynamics`, that every step follows the rules, or `agreement`, that all of it is one episode.
+def _environment(policy: UniMASKPolicy) -> Environment | None:
+    return environment_of_states(policy.number_names["s"])
+
+
+def make_check(policy: UniMASKPolicy, name: str, start: int = 0) -> Check:
+    """A check of the policy's environment by name, for windows that begin at a step of the episode.
 
     Raises:
-        ValueError: the policy's environment offers none.
+        ValueError: the environment offers no such check.
     """
-    if name is None:
-        return None
-    if _labels(policy)["s"] != DOORKEY:
+    environment = _environment(policy)
+    if environment is None or name not in environment.checks:
+        known = ", ".join(environment.checks) if environment else ""
         raise ValueError(
-            f"Only DoorKey offers its dynamics as a check; this policy's states are {_labels(policy)['s']}."
+            f"The environment of this policy, whose states are {', '.join(policy.number_names['s'])}, offers no check "
+            f"{name!r}; it offers {known or 'none'}."
         )
-    return DynamicsCheck(agree=name == "agreement", first_step=start)
+    return environment.make_check(name, start)
 
 
 def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
@@ -227,7 +200,8 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
                         said = _of_samples(reply.answer.values[name][:, step, i], component.categories)
                     else:
                         said = _of_marginals(reply.answer, name, step, i)
-                    row = {"token": f"{name}[{step}]", "step": step, "component": _labels(policy)[name][i]}
+                    label = policy.number_names[name][i]
+                    row = {"token": f"{name}[{step}]", "step": step, "factor": name, "component": label}
                     best = {} if reply.exact is None else {"exact": _of_marginals(reply.exact, name, step, i)}
                     table.append({**row, **said, **best, "recorded": recorded})
     return table
@@ -235,7 +209,7 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
 
 def _of_marginals(answer: Answer, name: str, step: int, i: int) -> dict[str, Any]:
     distribution = next(d for d in answer[name] if d.component.dims.start <= i < d.component.dims.stop)
-    if distribution.probabilities is None:
+    if isinstance(distribution, ContinuousDistribution):
         at = i - distribution.component.dims.start
         scale = None if distribution.scale is None else distribution.scale[0, step, at].item()
         return {"mean": distribution.mean[0, step, at].item(), "scale": scale}
@@ -256,41 +230,32 @@ def _number(value: Tensor, discrete: bool) -> int | float:
     return int(value) if discrete else value.item()
 
 
-def _labels(policy: UniMASKPolicy) -> dict[str, list[str]]:
-    """factor -> the name of each of its numbers."""
-    labels = {}
-    for name, columns in policy.config.features.items():
-        plain = {f.key: f.key.removeprefix("observation.") for f in columns}
-        numbered = ([plain[f.key]] if f.size == 1 else [f"{plain[f.key]}.{i}" for i in range(f.size)] for f in columns)
-        labels[name] = [label for f, numbers in zip(columns, numbered, strict=True) for label in f.names or numbers]
-    return labels
-
-
 def record(
-    loaded: Loaded,
+    policy: UniMASKPolicy,
     mask: str,
     reply: Reply,
     *,
+    source: Source | None,
     t: int | None,
     given: Given | None,
-    data: Mapping[str, Any] | None,
     sampling: Sampling | None,
-    exact: Expert | None = None,
+    exact: str | None = None,
 ) -> dict[str, Any]:
-    """Everything that decides an answer, and the answer, for a JSON.
-
-    Args:
-        data: the dataset, episode and first step that were read.
-    """
+    """Everything that decides an answer, and the answer, for a JSON; arguments as those of `ask`."""
+    data = None
+    if source is not None:
+        root = str(source.root) if source.root else None
+        data = {"root": root, "repo_id": source.repo_id, "episode": source.episode, "start": source.start}
     result: dict[str, Any] = {
-        "policy": {"path": loaded.path, "revision": loaded.revision, "updates": int(loaded.policy.updates)},
+        "policy": policy.describe_origin(),
         "mask": mask,
         "t": t,
         "given": dict(given or {}),
-        "data": dict(data) if data is not None else None,
+        "data": data,
         "exact": exact,
         "drawing": reply.mask.draw(),
-        "answers": rows(loaded.policy, reply),
+        "units": "those of the dataset; probabilities and shares from 0 to 1",
+        "answers": rows(policy, reply),
     }
     if sampling is not None and isinstance(reply.answer, Samples):
         counts = {name: getattr(reply.answer, name) for name in ("drawn", "rejected", "restarted", "acceptance")}
@@ -334,7 +299,15 @@ def _cells(answers: Sequence[Mapping[str, Any]], sampled: bool) -> Iterator[list
     heads = [value if discrete else "", "mean" if continuous else ""]
     weights = [weight if discrete else "", "scale" if continuous else ""]
     best = ["exact", "probability"] if "exact" in answers[0] else []
-    yield ["step", "component", " / ".join(filter(None, heads)), " / ".join(filter(None, weights)), *best, "recorded"]
+    yield [
+        "step",
+        "factor",
+        "component",
+        " / ".join(filter(None, heads)),
+        " / ".join(filter(None, weights)),
+        *best,
+        "recorded",
+    ]
     for row in answers:
         recorded = "" if row["recorded"] is None else f"{row['recorded']:.4g}"
         if "mean" in row:
@@ -342,7 +315,7 @@ def _cells(answers: Sequence[Mapping[str, Any]], sampled: bool) -> Iterator[list
         else:
             said = [str(row[value.replace(" ", "_")]), f"{row[weight]:.3f}"]
         best = [str(row["exact"]["most_likely"]), f"{row['exact']['probability']:.3f}"] if "exact" in row else []
-        yield [str(row["step"]), row["component"], *said, *best, recorded]
+        yield [str(row["step"]), row["factor"], row["component"], *said, *best, recorded]
 
 
 def _align(cells: Sequence[Sequence[str]]) -> list[str]:
@@ -350,22 +323,21 @@ def _align(cells: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     lines = []
     for row in cells:
-        parts = [c.ljust(w) if i == 1 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
+        parts = [c.ljust(w) if i in (1, 2) else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))]
         lines.append("  ".join(parts).rstrip())
     return lines
 
 
-def overview(loaded: Loaded) -> dict[str, Any]:
+def overview(policy: UniMASKPolicy) -> dict[str, Any]:
     """What one can ask a policy: its factors, and the named tasks that fit it, with their masks drawn."""
-    policy = loaded.policy
     K = policy.config.context_length
     factors = {}
     for name, factor in policy.factors.items():
         mean, std = (policy.statistics.get_buffer(f"{name}_{part}").tolist() for part in ("mean", "std"))
         factors[name] = [
-            {"component": _labels(policy)[name][i], "categories": component.categories}
+            {"component": policy.number_names[name][i], "categories": component.categories}
             if component.discrete
-            else {"component": _labels(policy)[name][i], "mean": mean[i], "std": std[i]}
+            else {"component": policy.number_names[name][i], "mean": mean[i], "std": std[i]}
             for component in factor.components
             if not component.computed
             for i in range(component.dims.start, component.dims.stop)
@@ -381,7 +353,7 @@ def overview(loaded: Loaded) -> dict[str, Any]:
         drawing = mask.draw()
         tasks.append({"name": name, "mask": text, "t": t, "drawing": drawing})
     return {
-        "policy": {"path": loaded.path, "revision": loaded.revision, "updates": int(policy.updates)},
+        "policy": policy.describe_origin(),
         "context_length": K,
         "attention": policy.config.attention,
         "training_masks": policy.training_masks.weights,
@@ -420,26 +392,20 @@ def describe_overview(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, maze: str = "medium") -> Figure:
-    """The picture that suits the environment and the answer; of any other model, its marginals or distributions.
-
-    Args:
-        maze: Maze2D's, see `maze_of`.
-    """
-    states = _labels(policy)["s"]
-    every_state = bool((reply.mask.shown["s"] | reply.mask.asked["s"]).all())
-    if isinstance(reply.answer, Samples):
-        if states == DOORKEY and every_state:
-            return trajectories({mask: reply.answer.values["s"].long().numpy(force=True)})
-        groups = {"sampled": _known(reply.answer, reply.mask)}
-        if reply.recorded is not None:
-            groups = {"recorded": _known(reply.recorded, reply.mask), **groups}
-        return distributions(groups, policy.factors)
-    if states == DOORKEY and every_state:
-        return state_distributions(reply.answer)
-    if states == MAZE2D and reply.mask.asked["s"].any():
-        return maze_trajectories(reply.answer, reply.recorded, maze=maze)
-    return marginals(reply.answer, reply.recorded)
+def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, source: Source | None = None) -> Figure:
+    """The picture that suits the environment and the answer; of any other model, its marginals or distributions."""
+    environment = _environment(policy)
+    if environment is not None and environment.draw_answer is not None:
+        provenance = provenance_of(source.folder) if source else {}
+        figure = environment.draw_answer(mask, reply.answer, reply.mask, reply.recorded, provenance)
+        if figure is not None:
+            return figure
+    if not isinstance(reply.answer, Samples):
+        return marginals(reply.answer, reply.recorded)
+    groups = {"sampled": _known(reply.answer, reply.mask)}
+    if reply.recorded is not None:
+        groups = {"recorded": _known(reply.recorded, reply.mask), **groups}
+    return distributions(groups, policy.factors)
 
 
 def _known(window: Window, mask: Mask) -> Window:

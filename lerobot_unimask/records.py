@@ -1,15 +1,47 @@
-"""A grid of runs as an Optuna study: any number of workers, on any number of machines, share what is left to do.
+"""Records: JSON files, the versions that they name, and tables of them."""
 
-Each run is a trial that is enqueued with its specification; a worker takes the next one, runs it, and stores its
-record, JSON, with the trial and as a file. Nothing is run twice: not by a second worker, not after an interruption. A
-worker that dies stops its heartbeat, and another takes up what it was doing (Optuna's retry callback). The
-storage is an SQLite file, for one machine, or any database that Optuna supports.
-"""
-
+import json
+import os
 import platform
-from importlib.metadata import version
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
 
 
-def versions() -> dict[str, str]:
-    names = ("torch", "lerobot", "lerobot_policy_unimask", "optuna")
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+def versions(*more: str) -> dict[str, str]:
+    """The versions that a result depends on: Python's and the packages', those of `more` where they are installed."""
+    found = {"python": platform.python_version()}
+    for name in ("torch", "lerobot", "lerobot_policy_unimask", *more):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def write_json(path: Path, content: Mapping[str, Any], *, say: bool = True) -> None:
+    """Write a record at once: the file is there in full or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}")
+    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.replace(path)
+    if say:
+        print(f"written to {path}")
+
+
+def read_json(path: Path) -> Any:
+    """
+    Raises:
+        ValueError: the file is not JSON.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read as JSON: {error}") from error
+
+
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table in Markdown; None is an empty cell."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join('' if cell is None else str(cell) for cell in line)} |" for line in lines)

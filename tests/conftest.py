@@ -6,23 +6,13 @@ os.environ["HF_HUB_OFFLINE"] = "1"  # read when huggingface_hub is imported
 
 import pytest
 import torch
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, KINDS, LAYOUTS, Episode
+
+import lerobot_policy_unimask  # noqa: F401 (registers policy and environments, as LeRobot's discovery does)
 
 torch.set_num_threads(1)  # two threads beside another busy process are many times slower than one
 
 EPISODES = 30
-CONTINUOUS_FEATURES = {
-    "observation.state": {"dtype": "float32", "shape": (3,), "names": ["x", "y", "goal"]},
-    "action": {"dtype": "float32", "shape": (2,), "names": None},
-    "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": None},
-}
-# Offsets and scales far from 0 and 1, so that a wrong unit shows.
-CONTINUOUS_STATS = {
-    "observation.state": {"mean": [100.0, -5.0, 0.5], "std": [10.0, 0.1, 0.0]},
-    "action": {"mean": [0.25, -2.0], "std": [0.5, 4.0]},
-    "observation.return_to_go": {"mean": [30.0], "std": [7.0]},
-    "frame_index": {"max": [49.0]},
-    "timestamp": {"max": [4.9]},
-}
 
 
 @pytest.fixture(scope="session")
@@ -98,3 +88,24 @@ def tiny_policy(doorkey):
             return UniMASKPolicy(config, dataset_stats=stats or doorkey.meta.stats).eval()
 
     return make
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(params=LAYOUTS)
+def layout(request):
+    return request.param
+
+
+@pytest.fixture
+def batch_of(doorkey_batch, continuous_batch):
+    return lambda kind: doorkey_batch if kind == "doorkey" else continuous_batch
+
+
+@pytest.fixture
+def states():
+    """Six steps of four environments."""
+    return Episode("continuous", 4, 6).states

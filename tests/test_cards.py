@@ -9,6 +9,8 @@ import yaml
 from PIL import Image
 
 from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask.envs.doorkey.record import DOORKEY
+from lerobot_unimask.envs.maze2d.record import MAZE2D
 from lerobot_unimask.sharing import cards
 
 TRAIN_CONFIG = {"dataset": {"repo_id": "me/doorkey", "root": None}, "env": {"type": "doorkey"}}
@@ -26,9 +28,15 @@ def read(files: dict[str, bytes]) -> tuple[dict, str]:
     return yaml.safe_load(metadata), body
 
 
+def card(policy, repo_id="me/policy", results=(), **told):
+    """A policy's card from the facts that pushing takes off it."""
+    facts = cards.PolicyFacts(policy.config, policy.training_masks.weights, parameters=1000, updates=7, **told)
+    return cards.policy_card(facts, repo_id, results)
+
+
 def test_a_policy_s_card_draws_the_questions_it_was_trained_on(tiny_policy) -> None:
     policy = tiny_policy(training_masks={"goal_conditioned": 3, "s[1:9] | s[0]": 1, "random_mask": 4})
-    metadata, body = read(cards.policy_card(policy, "me/policy", train_config=TRAIN_CONFIG, command="lerobot-train x"))
+    metadata, body = read(card(policy, "me/policy", train_config=TRAIN_CONFIG, command="lerobot-train x"))
     assert metadata["library_name"] == "lerobot"
     assert metadata["datasets"] == ["me/doorkey"]
     assert "goal_conditioned (38%): a[t] | s[:t+1], a[:t], s[-1]   at t = 5" in body
@@ -44,43 +52,43 @@ def test_a_policy_s_card_draws_the_questions_it_was_trained_on(tiny_policy) -> N
 
 @pytest.mark.parametrize("masks", [["random_mask", "past"], "random_mask"])
 def test_the_question_to_try_is_one_that_can_be_asked(tiny_policy, masks) -> None:
-    body = read(cards.policy_card(tiny_policy(training_masks=masks), "me/policy"))[1]
+    body = read(card(tiny_policy(training_masks=masks), "me/policy"))[1]
     assert f"--mask={'past' if len(masks) == 2 else 'behavior_cloning'} --t=" in body
 
 
 def test_a_policy_s_card_says_which_data(tiny_policy) -> None:
     policy = tiny_policy()
     local = {"dataset": {"repo_id": "local/doorkey", "root": "data/door key"}, "env": None}
-    metadata, body = read(cards.policy_card(policy, "me/policy", train_config=local))
+    metadata, body = read(card(policy, "me/policy", train_config=local))
     assert "datasets" not in metadata
     assert "`local/doorkey`, local" in body
     assert "--dataset.root='data/door key'" in body
     assert "lerobot-train --config_path=me/policy" in body
     policy.config.dataset_revision = "c0ffee"
     pulled = {"dataset": {"repo_id": "me/doorkey", "root": None}, "env": None}
-    assert "`me/doorkey`, at revision `c0ffee`" in read(cards.policy_card(policy, "me/p", train_config=pulled))[1]
-    assert "How it was trained was not saved" in read(cards.policy_card(policy, "me/p"))[1]
+    assert "`me/doorkey`, at revision `c0ffee`" in read(card(policy, "me/p", train_config=pulled))[1]
+    assert "How it was trained was not saved" in read(card(policy, "me/p"))[1]
 
 
 def test_a_policy_s_card_has_the_results_that_it_is_given(tiny_policy) -> None:
     folder = Path(__file__).parent.parent / "docs" / "results"
     names = ("doorkey_20000.json", "doorkey_20000_most_likely.json")
     records = [json.loads((folder / name).read_text()) for name in names]
-    body = read(cards.policy_card(tiny_policy(), "me/policy", results=records))[1]
+    body = read(card(tiny_policy(), "me/policy", results=records))[1]
     assert f"| `past` | {records[0]['mean']['past']:.3f} |" in body
     assert "Rollouts: 1,000 episodes" in body
     with pytest.raises(ValueError, match="unimask validate"):
-        cards.policy_card(tiny_policy(), "me/policy", results=[{"loss": 1}])
+        card(tiny_policy(), "me/policy", results=[{"loss": 1}])
 
 
 def test_the_card_of_a_continuous_model_without_data(tiny_policy) -> None:
-    body = read(cards.policy_card(tiny_policy("gaussian", context_length=5), "me/policy"))[1]
+    body = read(card(tiny_policy("gaussian", context_length=5), "me/policy"))[1]
     assert "| `s` | `observation.state` | 3 | x, y, goal | continuous |" in body
     assert "--env.type=YOUR_ENVIRONMENT" in body
 
 
 def test_a_dataset_s_card_says_how_it_was_made(doorkey_root: Path) -> None:
-    metadata, body = read(cards.dataset_card(doorkey_root, "me/doorkey"))
+    metadata, body = read(cards.dataset_card(doorkey_root, "me/doorkey", DOORKEY))
     assert metadata["license"] == "apache-2.0"
     assert metadata["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
     for words in ("4 x 4 cells", "- expert: paper: noisily rational", "seed 0", "- episodes: 30, 300 steps"):
@@ -92,7 +100,7 @@ def test_a_dataset_s_card_says_how_it_was_made(doorkey_root: Path) -> None:
 
 def test_maze2d_s_card(tmp_path: Path) -> None:
     root = build_maze2d(tmp_path / "maze", episodes=2, noise=0.25, maze="umaze", progress=False)
-    body = read(cards.dataset_card(root, "me/maze"))[1]
+    body = read(cards.dataset_card(root, "me/maze", MAZE2D))[1]
     assert "- settings: noise 0.25, maze umaze, seed 0" in body
     assert "Maze2D, a point mass" in body
 
@@ -107,4 +115,4 @@ def test_any_other_dataset_has_a_card_too(doorkey_root: Path, tmp_path: Path) ->
 
 def test_a_card_is_the_same_twice(tiny_policy) -> None:
     """So that pushing again changes nothing."""
-    assert cards.policy_card(tiny_policy(), "me/policy") == cards.policy_card(tiny_policy(), "me/policy")
+    assert card(tiny_policy(), "me/policy") == card(tiny_policy(), "me/policy")

@@ -25,7 +25,6 @@ def parse(*arguments):
         ({"context_length": 5000}, "context_length is 5000"),
         ({"token_layout": "heap"}, "token_layout is 'heap'; choose one of stacked, separate"),
         ({"attention": "sideways"}, "attention is 'sideways'; choose one of both, bidirectional, causal"),
-        ({"causal_draw": "batch"}, "causal_draw is 'batch'; choose one of window, update"),
         ({"causal_share": 1.0}, "causal_share is 1.0; it must lie between 0 and 1"),
         ({"token_layout": "stacked"}, "token_layout=stacked needs attention=bidirectional"),
         ({"continuous_head": "mixture"}, "continuous_head is 'mixture'; choose one of l2, gaussian"),

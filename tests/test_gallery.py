@@ -53,5 +53,5 @@ def test_a_maze_policy_has_its_picture(tiny_policy):
 
 def test_a_maze_policy_needs_its_data(capsys):
     with pytest.raises(SystemExit):
-        cli.main(["gallery", "--policy.path=p", "--dataset.root=d", "--maze.path=m"])
+        cli.main(["paper", "gallery", "--policy.path=p", "--dataset.root=d", "--maze.path=m"])
     assert "--maze.path and --maze.root go together" in capsys.readouterr().err

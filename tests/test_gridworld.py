@@ -9,7 +9,7 @@ import torch
 
 from dataset_builders.doorkey import FEATURES
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
-from lerobot_unimask.envs.doorkey.episodes import rollout
+from lerobot_unimask.envs.doorkey.episodes import rollout as expert_rollout
 from lerobot_unimask.envs.doorkey.optimum import Optimum
 from lerobot_unimask.envs.doorkey.panels import (
     BACKWARDS,
@@ -21,7 +21,7 @@ from lerobot_unimask.envs.doorkey.panels import (
     given_states,
     possible_steps,
     predicted_states,
-    roll_out,
+    rollout,
     rollout_panel,
     state_at,
 )
@@ -50,7 +50,7 @@ def panels(policy):
 
 def test_a_rollout_plays_by_the_rules(policy):
     starts = START_PAIRS[::5]
-    played = roll_out(policy, starts, IMITATION, {}, sample=True)
+    played = rollout(policy, starts, IMITATION, {}, sample=True)
     agent, key, door_open = (array[:, :-1] for array in played[:3])
     expected = step(agent, key, door_open, played.action)
     for name, after in zip(("agent", "key", "door_open"), expected, strict=True):
@@ -63,15 +63,15 @@ def test_a_rollout_plays_by_the_rules(policy):
 
 def test_a_rollout_in_a_batch_is_the_rollout_alone(policy):
     starts = START_PAIRS[:7]
-    together = roll_out(policy, starts, IMITATION, {})
+    together = rollout(policy, starts, IMITATION, {})
     for n, start in enumerate(starts):
-        np.testing.assert_array_equal(roll_out(policy, [start], IMITATION, {}).action[0], together.action[n])
+        np.testing.assert_array_equal(rollout(policy, [start], IMITATION, {}).action[0], together.action[n])
 
 
 def test_sampled_rollouts_follow_their_seed_and_leave_the_global_generator(policy):
     before = torch.get_rng_state()
     first, again, other = (
-        roll_out(policy, START_PAIRS, IMITATION, {}, sample=True, seed=seed).action for seed in (1, 1, 2)
+        rollout(policy, START_PAIRS, IMITATION, {}, sample=True, seed=seed).action for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
@@ -81,10 +81,10 @@ def test_sampled_rollouts_follow_their_seed_and_leave_the_global_generator(polic
 def test_each_episode_may_be_given_its_own_value(policy):
     question, _ = ROLLOUTS["A wanted return"]
     returns = torch.tensor([0.0, 500.0])
-    together = roll_out(policy, [START, START], question, {"rtg[0]": returns})
+    together = rollout(policy, [START, START], question, {"rtg[0]": returns})
     for n, wanted in enumerate(returns.tolist()):
         np.testing.assert_array_equal(
-            roll_out(policy, [START], question, {"rtg[0]": wanted}).action[0], together.action[n]
+            rollout(policy, [START], question, {"rtg[0]": wanted}).action[0], together.action[n]
         )
 
 
@@ -127,7 +127,7 @@ def test_given_states_are_found_by_step():
 
 def test_histories_drawn_backwards_are_possible_and_end_in_the_given_state(monkeypatch):
     policy = make_policy()
-    monkeypatch.setattr(policy, "predict", Optimum())  # what a policy that has learnt everything would answer
+    monkeypatch.setattr(policy, "predict", Optimum().predict)  # what a policy that has learnt everything would answer
     panel = backwards_panel(policy, histories=20)
     states, actions = np.array(panel.states), np.array(panel.actions)
     assert states.shape == (20, HORIZON, 2)
@@ -145,7 +145,7 @@ def test_a_policy_that_draws_nothing_possible_has_an_empty_panel(policy, monkeyp
 
 
 def test_every_step_of_the_expert_is_possible():
-    episodes = rollout(500, np.random.default_rng(0))
+    episodes = expert_rollout(500, np.random.default_rng(0))
     states = np.stack([episodes.agent, episodes.key], axis=-1)
     assert possible_steps(states, episodes.action).all()
     assert not possible_steps(states, (episodes.action + 2) % 4).all()

@@ -144,12 +144,12 @@ def test_bad_settings_are_named(tmp_path, capsys):
     ):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(SystemExit):
-            cli.main(["heatmap", f"--config_path={tmp_path / 'bad.yaml'}"])
+            cli.main(["paper", "heatmap", f"--config_path={tmp_path / 'bad.yaml'}"])
         assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_the_two_minute_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    cli.main(["heatmap", f"--config_path={CONFIGS / 'heatmap_quick.yaml'}", "--workers=2"])
+    cli.main(["paper", "heatmap", f"--config_path={CONFIGS / 'heatmap_quick.yaml'}", "--workers=2"])
     assert Path("outputs/heatmap_quick/heatmap_50.png").exists()

@@ -1,18 +1,19 @@
 """Answers, joint samples and the rollout's memory, against networks whose answers are known."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from lerobot_unimask.asking.answers import answer
-from lerobot_unimask.asking.given import check_known, give, read_given
+from lerobot_unimask.asking.given import check_known, give, in_window, read_given
 from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.sampling import ORDERS, sample
 from lerobot_unimask.data.factors import Feature, make_factors
 from lerobot_unimask.data.window import Statistics, Window
 from lerobot_unimask.language.grammar import MaskError
-from lerobot_unimask.language.masks import Mask, tabulate
+from lerobot_unimask.language.masks import Mask, Token, tabulate
 
 # --- A network that knows the joint distribution ---------------------------------------------------------------------
 
@@ -45,6 +46,10 @@ def exact_network(window, mask, cache=None):
     return predictions
 
 
+def model(network, statistics=STATISTICS, factors=FACTORS):
+    return SimpleNamespace(predict=network, statistics=statistics, factors=factors)
+
+
 def empty_window(B):
     values = {name: torch.full((B, K, 1), torch.nan) for name in FACTORS}
     return Window(values, torch.ones(B, K, dtype=torch.bool))
@@ -52,7 +57,7 @@ def empty_window(B):
 
 def draw(window, mask, order, seed=0, network=exact_network):
     generator = torch.Generator().manual_seed(seed)
-    return sample(network, STATISTICS, FACTORS, window, mask, order=order, generator=generator)
+    return sample(model(network), window, mask, order=order, generator=generator)
 
 
 def outcome_numbers(window):
@@ -101,7 +106,7 @@ def test_orders_are_what_they_are_called():
     def order_of(order, seed=0):
         seen = []
 
-        def spy(window, mask, cache):
+        def spy(window, mask, cache=None):
             shown = mask.shown.items()
             seen.append({(name, k) for name, here in shown for k in here[0].nonzero().flatten().tolist()})
             return exact_network(window, mask)
@@ -162,9 +167,7 @@ def sample_all(N, check, order="forward", seed=0, **settings):
     mask = tabulate("s[:], a[:]", ("s", "a"), K).at(None, N)
     generator = torch.Generator().manual_seed(seed)
     window = empty_window(N)
-    return sample(
-        exact_network, STATISTICS, FACTORS, window, mask, order=order, generator=generator, check=check, **settings
-    )
+    return sample(model(exact_network), window, mask, order=order, generator=generator, check=check, **settings)
 
 
 def test_what_contradicts_the_check_is_drawn_again():
@@ -243,7 +246,7 @@ def test_an_answer_holds_the_networks_probabilities():
     window = empty_window(1)
     window.values["a"][:, 0] = 2.0
     mask = tabulate("s[1] | a[0]", ("s", "a"), K).at(None)
-    said = answer(exact_network, STATISTICS, FACTORS, window, mask)
+    said = answer(model(exact_network), window, mask)
     conditional = JOINT * (OUTCOMES[:, 1] == 2)
     expected = [(conditional[OUTCOMES[:, 2] == value].sum() / conditional.sum()).item() for value in (0, 1)]
     assert said["s"][0].probabilities[0, 1].tolist() == pytest.approx(expected)
@@ -258,7 +261,7 @@ def test_an_answer_holds_the_networks_probabilities():
 
 def test_a_draw_follows_the_probabilities():
     mask = tabulate("s[:], a[:]", ("s", "a"), K).at(None, 6000)
-    said = answer(exact_network, STATISTICS, FACTORS, empty_window(6000), mask)
+    said = answer(model(exact_network), empty_window(6000), mask)
     drawn = said["a"][0].draw(torch.Generator().manual_seed(0))
     assert drawn.shape == (6000, K, 1)
     for step in range(K):
@@ -276,12 +279,12 @@ def test_continuous_answers_are_in_the_datasets_units():
     )
     seen = {}
 
-    def network(window, mask, cache):
+    def network(window, mask, cache=None):
         seen.update(window.values)
         return {"s": [torch.ones(1, 3, 2)], "a": [torch.full((1, 3, 1), -2.0)]}
 
     window = Window({"s": torch.full((1, 3, 2), 7.0), "a": torch.full((1, 3, 1), 7.0)}, torch.ones(1, 3).bool())
-    said = answer(network, statistics, factors, window, tabulate("s[2], a[0] | s[0]", ("s", "a"), 3).at(None))
+    said = answer(model(network, statistics, factors), window, tabulate("s[2], a[0] | s[0]", ("s", "a"), 3).at(None))
     assert seen["s"][0, 0].tolist() == [-1.5, 2.0]
     assert said.most_likely("s")[0].nan_to_num(-99).tolist() == [[7, 7], [-99, -99], [12, 3]]
     assert said.most_likely("a")[0].nan_to_num(-99).tolist() == [[4], [-99], [-99]]
@@ -296,11 +299,13 @@ def test_a_gaussian_head_answers_with_a_mean_and_a_scale():
     B = 4000
     output = torch.tensor([1.0, 0.5]).expand(B, 3, 2)  # mean and logarithm of the scale
 
-    def network(window, mask, cache):
+    def network(window, mask, cache=None):
         return {"s": [output], "a": [output]}
 
     window = Window({name: torch.full((B, 3, 1), 7.0) for name in features}, torch.ones(B, 3).bool())
-    said = answer(network, statistics, factors, window, tabulate("s[1] | s[0]", ("s", "a"), 3).at(None, B))["s"][0]
+    said = answer(model(network, statistics, factors), window, tabulate("s[1] | s[0]", ("s", "a"), 3).at(None, B))["s"][
+        0
+    ]
     scale = 2 * torch.tensor(0.5).exp().item()
     assert said.mean[0, :, 0].nan_to_num(-99).tolist() == [7, 12, -99]
     assert said.scale[0, :, 0].nan_to_num(-99).tolist() == pytest.approx([0, scale, -99])
@@ -326,14 +331,14 @@ GRID = make_factors(
 def test_given_values_may_be_shared_or_one_for_each_environment():
     given = {"s[-1]": [15, 14], "a[0]": 3, "a[1]": [0, 1, 2], "rtg[0]": [[1.5], [2], [3]], "s[2]": torch.ones(3, 2)}
     tokens = read_given(given, GRID, 5, 3)
-    assert {token: value.tolist() for token, value in tokens.items()} == {
+    assert {(token.factor, token.step): value.tolist() for token, value in tokens.items()} == {
         ("s", 4): [[15, 14]],
         ("a", 0): [[3]],
         ("a", 1): [[0], [1], [2]],
         ("rtg", 0): [[1.5], [2], [3]],
         ("s", 2): [[1, 1]] * 3,
     }
-    assert read_given({"s[0]": [1, 2]}, GRID, 5, 2)["s", 0].tolist() == [[1, 2]]  # two numbers, two environments
+    assert read_given({"s[0]": [1, 2]}, GRID, 5, 2)[Token("s", 0)].tolist() == [[1, 2]]  # two numbers, two environments
 
 
 @pytest.mark.parametrize(
@@ -373,7 +378,8 @@ def test_observed_values_win_over_given_ones():
     values = {"s": torch.zeros(2, 3, 2), "a": torch.zeros(2, 3, 1), "rtg": torch.full((2, 3, 2), 0.5)}
     window = Window(values, torch.ones(2, 3, dtype=torch.bool))
     known = {"s": torch.tensor([True, False, False]), "a": torch.zeros(3).bool(), "rtg": torch.zeros(3).bool()}
-    tokens = read_given({"s[0]": [9, 9], "s[2]": [[1, 2], [3, 4]], "rtg[0]": 6}, GRID, 3, 2)
+    given = {"s[0]": [9, 9], "s[2]": [[1, 2], [3, 4]], "rtg[0]": 6}
+    tokens = in_window(read_given(given, GRID, 3, 2), 0, 3)
     filled, filled_known = give(window, tokens, known)
     assert filled.values["s"].tolist() == [[[0, 0], [0, 0], [1, 2]], [[0, 0], [0, 0], [3, 4]]]
     assert filled.values["rtg"][:, 0].tolist() == [[6, 0.5], [6, 0.5]]  # the timestep stays as it is

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lerobot_unimask.language.grammar import MAX_CONTEXT, MAX_TEXT, MaskError
-from lerobot_unimask.language.masks import RANDOM_MASK, REGIMES, TASKS, Mask, parse, parse_token, tabulate
+from lerobot_unimask.language.masks import RANDOM_MASK, REGIMES, TASKS, Mask, Token, parse, parse_token, tabulate
 
 FACTORS = ("s", "a", "rtg")
 QUESTIONS = [
@@ -265,8 +265,9 @@ def test_garbage_ends_in_a_mask_error():
 
 
 def test_a_given_token_is_a_single_one():
-    assert parse_token("s[-1]", FACTORS, 10) == ("s", 9)
-    assert parse_token(" rtg [ 0 ] ", FACTORS, 10) == ("rtg", 0)
+    assert parse_token("s[-1]", FACTORS, 10) == Token("s", 9)
+    assert parse_token(" rtg [ 0 ] ", FACTORS, 10) == Token("rtg", 0)
+    assert parse_token("s@150", FACTORS, 10) == Token("s", 150, of_episode=True)
     for text in (
         "s[t]",
         "s[:]",
@@ -277,6 +278,8 @@ def test_a_given_token_is_a_single_one():
         "s[10]",
         "rtg[1]",
         "q[0]",
+        "s@-1",
+        "rtg@3",
         "past",
         "",
     ):

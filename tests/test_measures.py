@@ -10,6 +10,7 @@ from torch.distributions import Categorical, Normal, kl_divergence
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.cli import main
+from lerobot_unimask.data.episodes import open_dataset
 from lerobot_unimask.data.factors import Component
 from lerobot_unimask.measures import (
     _divergence,
@@ -45,17 +46,21 @@ def make(root):
     return policy
 
 
+def windows(policy, root):
+    return unseen_windows(open_dataset(policy.config, root), policy.config.context_length, LAST)
+
+
 def test_windows_are_full_and_of_these_episodes_alone(make, root):
-    batch = unseen_windows(make(), root, LAST)
+    batch = windows(make(), root)
     assert set(batch["episode_index"].tolist()) == set(LAST)
     assert not batch["observation.state_is_pad"].any()
     with pytest.raises(ValueError, match="None of these episodes"):
-        unseen_windows(make(context_length=300), root, LAST)
+        windows(make(context_length=300), root)
 
 
 def test_the_error_ahead_is_the_distance_to_the_true_state(make, root):
     policy = make()
-    batch = unseen_windows(policy, root, LAST)
+    batch = windows(policy, root)
     found = error_ahead(policy, batch, 3)  # from step 4 to step 7
     states = batch["observation.state"]
     answers = policy.infer(batch, "s[7] | s[:5], a[:4]").most_likely("s")[:, 7]
@@ -71,7 +76,7 @@ def test_the_error_ahead_is_the_distance_to_the_true_state(make, root):
 
 def test_the_action_error_is_that_of_the_answers_to_each_step(make, root):
     policy = make()
-    batch = unseen_windows(policy, root, LAST)
+    batch = windows(policy, root)
     actions = policy.make_window(batch).values["a"]
     steps = range(policy.config.context_length)
     answers = [policy.infer(batch, "behavior_cloning", t=t).most_likely("a")[:, t] for t in steps]
@@ -93,23 +98,28 @@ def test_divergences_are_those_of_torch():
 
 def test_directions_that_say_the_same_disagree_by_nothing(make, root):
     policy = make()
-    batch = unseen_windows(policy, root, LAST)
+    batch = windows(policy, root)
     assert disagreement(policy, batch, "behavior_cloning") > 0
     for parameter in policy.network.heads["a"].parameters():
         torch.nn.init.zeros_(parameter)
     assert disagreement(policy, batch, "behavior_cloning") == 0
 
 
-def test_a_record_holds_what_applies(make, root):
-    assert set(measure(make(), root, LAST, ahead=3)) == {
-        "windows",
-        "episodes",
-        "action_error",
-        "ahead",
-        "disagreement_nats",
-    }
-    assert "disagreement_nats" not in measure(make(attention="bidirectional"), root, LAST, ahead=3)
-    assert "ahead" not in measure(make(), root, LAST, ahead=7)
+@pytest.mark.parametrize(
+    ("settings", "ahead", "parts"),
+    [
+        ({}, 3, {"action_error", "ahead", "disagreement_nats"}),
+        ({"attention": "bidirectional"}, 3, {"action_error", "ahead"}),
+        ({}, 7, {"action_error", "disagreement_nats"}),
+    ],
+)
+def test_a_record_holds_what_applies(make, root, settings, ahead, parts):
+    policy = make(**settings)
+    record = measure(policy, open_dataset(policy.config, root), LAST, ahead=ahead)
+    assert set(record) == {"what", "windows", "episodes"} | parts
+
+
+def test_latency_is_a_median_between_quartiles(make):
     timed = latency(make(), calls=5)
     assert 0 < timed["quartiles_ms"][0] <= timed["median_ms"] <= timed["quartiles_ms"][1]
 
@@ -135,7 +145,7 @@ policy: {{device: cpu, width: 16, depth: 1, heads: 2, feedforward_width: 16, dro
 data: {root}
 output: {tmp_path / "out"}
 """)
-    main(["ablation", f"--config_path={config}"])
+    main(["paper", "ablation", f"--config_path={config}"])
     record = json.loads((tmp_path / "out" / "short.json").read_text())
     assert [(run["row"], run["context_length"]) for run in record["runs"]] == [
         ("both", 4), ("plain", 4), ("zeros", 4), ("both", 6), ("plain", 6), ("zeros", 6),
@@ -172,5 +182,5 @@ output: {tmp_path / "out"}
 def test_a_wrong_configuration_is_refused(tmp_path, capsys, line, message):
     (tmp_path / "wrong.yaml").write_text(line + "\n")
     with pytest.raises(SystemExit):
-        main(["ablation", f"--config_path={tmp_path / 'wrong.yaml'}"])
+        main(["paper", "ablation", f"--config_path={tmp_path / 'wrong.yaml'}"])
     assert message in capsys.readouterr().err

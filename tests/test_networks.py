@@ -37,6 +37,7 @@ def make_network(kind, layout, dropout=0.0):
         factors,
         context_length=K,
         stacked="stacked" in layout,
+        residuals="plain" not in layout,
         fine_inputs="plain" not in layout,
         width=16,
         depth=2,
@@ -233,7 +234,8 @@ def test_states_that_go_straight_on_are_predicted_before_anything_is_learnt():
 
 
 @pytest.mark.parametrize(
-    ("network", "settings"), [(Transformer, {"stacked": True, "heads": 2, "depth": 1}), (FeedForward, {"depth": 2})]
+    ("network", "settings"),
+    [(Transformer, {"stacked": True, "residuals": False, "heads": 2, "depth": 1}), (FeedForward, {"depth": 2})],
 )
 def test_a_network_learns_what_a_mask_hides(network, settings):
     """Forward dynamics of a ring, s[k + 1] = (s[k] + 1) mod 7, from one shown state: model and loss together."""

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def count(episodes: Episodes, weight: np.ndarray, window: Window, shown: dict, f
 
 def marginals(window: Window, shown: dict, **settings) -> dict[str, np.ndarray]:
     """The first window's, (K, categories) each."""
-    predictions = Optimum(**settings)(window, showing(shown))
+    predictions = Optimum(**settings).predict(window, showing(shown))
     (agent, key), (action,) = predictions["s"], predictions["a"]
     return {name: part[0].exp().numpy() for name, part in (("agent", agent), ("key", key), ("action", action))}
 
@@ -132,7 +133,7 @@ def test_marginals_equal_enumeration(monkeypatch, expert, horizon, first, K):
     windows = window_of(states, episodes.action[chosen, first : first + K], returns, first / horizon)
     shown = {name: torch.from_numpy(rng.random((60, K)) < rng.random((60, 1))) for name in ("s", "a")}
     shown["rtg"] = (torch.arange(60)[:, None] % 2 == 0) & (torch.arange(K) == 0)
-    together = Optimum(expert, first_step=first)(windows, showing(shown))
+    together = Optimum(expert, first_step=first).predict(windows, showing(shown))
     for b in range(60):
         one = {name: value[b : b + 1] for name, value in shown.items()}
         expected, _ = count(episodes, probability, row(windows, b), one, first)
@@ -180,15 +181,15 @@ def test_what_is_hidden_changes_nothing(recorded):
     hidden = {
         name: torch.where(mask.shown[name].unsqueeze(-1), value, torch.nan) for name, value in recorded.values.items()
     }
-    before, after = Optimum()(recorded, mask), Optimum()(Window(hidden, recorded.valid), mask)
+    before, after = Optimum().predict(recorded, mask), Optimum().predict(Window(hidden, recorded.valid), mask)
     assert all(torch.equal(p, q) for name in before for p, q in zip(before[name], after[name], strict=True))
 
 
 def test_answers_do_not_depend_on_the_batch(recorded, monkeypatch):
     mask = mask_of("reward_conditioned", 3)
-    whole = Optimum()(recorded, mask)
+    whole = Optimum().predict(recorded, mask)
     monkeypatch.setattr(module, "_CHUNK", 7)
-    parts = Optimum()(recorded, mask)
+    parts = Optimum().predict(recorded, mask)
     for name in whole:
         for p, q in zip(whole[name], parts[name], strict=True):
             torch.testing.assert_close(p, q, rtol=0, atol=1e-12)
@@ -243,8 +244,8 @@ def test_steps_past_the_episodes_end_are_not_seen(recorded):
         torch.arange(10).expand(20, 10) < 3,
     )
     mask = mask_of("a[:] | s[:2], rtg[0]", B=20).within(padded.valid)
-    one = Optimum(first_step=7)(short, showing({name: tokens[:, :3] for name, tokens in mask.shown.items()}))
-    other = Optimum(first_step=7)(padded, mask)
+    one = Optimum(first_step=7).predict(short, showing({name: tokens[:, :3] for name, tokens in mask.shown.items()}))
+    other = Optimum(first_step=7).predict(padded, mask)
     torch.testing.assert_close(one["a"][0], other["a"][0][:, :3])
 
 
@@ -259,7 +260,7 @@ def test_its_loss_is_the_entropy_in_expectation_and_no_answer_is_better():
     window = window_of(states, episodes.action, episodes.reward.sum(axis=1))
     for text in TASKS:
         mask = TrainingMasks(text, tuple(FACTORS), 10)(window.valid, torch.arange(4000) * 10, seed=0, step=-1)
-        exact = Optimum()(window, mask)
+        exact = Optimum().predict(window, mask)
         loss = sum(part.item() for part in masked_losses(exact, window, mask.asked, FACTORS).values())
         expected = mean_over_asked(entropies(exact), mask.asked)
         assert math.isfinite(loss)
@@ -281,11 +282,11 @@ def test_divergence_is_zero_from_itself_and_the_textbooks_otherwise():
 def test_random_masks_are_measured_by_kind_and_by_what_they_hide(recorded):
     index = torch.arange(60) * 10
 
-    def uniform(window: Window, mask: Mask, cache: None) -> dict:
+    def uniform(window: Window, mask: Mask) -> dict:
         return {"s": [torch.zeros(60, 10, 16)] * 2, "a": [torch.zeros(60, 10, 4)]}
 
     exact = random_mask_divergence(Optimum(), Optimum(), recorded, recorded, index, draws=2)
-    found = random_mask_divergence(Optimum(), uniform, recorded, recorded, index, draws=2)
+    found = random_mask_divergence(Optimum(), SimpleNamespace(predict=uniform), recorded, recorded, index, draws=2)
     assert found.keys() == exact.keys() == {"agent_cell", "key_cell", "direction"}
     for label, size in (("agent_cell", 16), ("key_cell", 16), ("direction", 4)):
         assert set(found[label]) == {"0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "all"}

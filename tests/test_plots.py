@@ -242,7 +242,7 @@ def test_distributions_are_shares_of_each_group(policy, tiny_policy, continuous_
     continuous = tiny_policy("continuous")
     window = continuous.make_window(continuous_batch)
     labels = [axes.get_xlabel() for axes in distributions({"all": window}, continuous.factors).axes]
-    assert labels[:5] == ["s: state[0]", "s: state[1]", "s: state[2]", "a: action[0]", "a: action[1]"]
+    assert labels[:5] == ["s: x", "s: y", "s: goal", "a: action.0", "a: action.1"]
     nothing = Window({name: values * torch.nan for name, values in window.values.items()}, window.valid)
     with pytest.raises(ValueError, match="nothing to draw"):
         distributions({"all": window, "none": nothing}, continuous.factors)

@@ -1,14 +1,14 @@
 """`unimask query`: its table and JSON are the policy's answers, and whoever mistypes is told what would have worked."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from lerobot_unimask import cli, query
+from lerobot_unimask import UniMASKPolicy, cli, query
+from lerobot_unimask.data.episodes import read_window
 from lerobot_unimask.envs.doorkey.expert import expert_probabilities
 from lerobot_unimask.envs.doorkey.optimum import exact_answer
 from lerobot_unimask.envs.doorkey.rules import DynamicsCheck
@@ -64,7 +64,7 @@ def test_the_json_holds_the_policys_answer_and_all_that_decides_it(ask, tiny_pol
     assert (result["mask"], result["t"], result["given"]) == (MASK, None, {})
     assert result["data"] == {"root": str(doorkey_root), "repo_id": None, "episode": 3, "start": 0}
     policy = tiny_policy()
-    batch = query.read_window(doorkey, 3)
+    batch = read_window(doorkey, 3)
     answer, window = policy.infer(batch, MASK), policy.make_window(batch)
     asked = [("s", 1, 0), ("s", 1, 1), ("s", 2, 0), ("s", 2, 1), ("s", 3, 0), ("s", 3, 1), ("a", 0, 0), ("a", 1, 0)]
     asked.sort(key=lambda token: (token[1], token[0] == "a"))
@@ -84,10 +84,10 @@ def test_the_table_has_a_row_for_each_component(ask):
     said = ask(f"--mask={MASK}", episode=3)
     assert "s #???#.....  a ??........" in said
     assert "episode 3 of" in said
-    table = said[said.index("step  component") :].splitlines()
-    assert table[0].split() == ["step", "component", "most", "likely", "probability", "recorded"]
+    table = said[said.index("step  factor") :].splitlines()
+    assert table[0].split() == ["step", "factor", "component", "most", "likely", "probability", "recorded"]
     assert len(table) == 9
-    assert all(len(row.split()) == 5 for row in table[1:])
+    assert all(len(row.split()) == 6 for row in table[1:])
 
 
 def test_values_need_no_dataset(ask, tiny_policy):
@@ -104,7 +104,7 @@ def test_values_need_no_dataset(ask, tiny_policy):
 def test_a_window_may_start_later_and_what_lies_past_the_end_is_not_asked(ask, tiny_policy, doorkey):
     result = json.loads(ask("--mask=future", "--t=1", "--start=7", "--json", episode=2))
     assert [row["token"] for row in result["answers"] if row["component"] == "direction"] == ["a[1]", "a[2]"]
-    batch = query.read_window(doorkey, 2, 7)
+    batch = read_window(doorkey, 2, 7)
     expected = tiny_policy().infer(batch, "future", t=1)["a"][0].probabilities[0, 2]
     assert result["answers"][-1]["probabilities"] == pytest.approx(expected.tolist())
 
@@ -114,7 +114,7 @@ def test_the_exact_optimum_answers_the_same_question(ask, tiny_policy, doorkey):
     flags = (f"--mask={question}", "--start=6", '--given={"s[0]": [12, 12]}', "--exact=paper")
     result = json.loads(ask(*flags, "--json", episode=2))
     assert result["exact"] == "paper"
-    window = tiny_policy().make_window(query.read_window(doorkey, 2, 6))
+    window = tiny_policy().make_window(read_window(doorkey, 2, 6))
     window.values["s"][0, 0] = 12
     mask = tabulate(question, tuple(window.values), 10).at(None).within(window.valid)
     exact = exact_answer(window, mask, first_step=6)
@@ -125,9 +125,9 @@ def test_the_exact_optimum_answers_the_same_question(ask, tiny_policy, doorkey):
         assert row["exact"]["probability"] == pytest.approx(probabilities.max().item())
     said = ask(*flags, episode=2)
     assert "for data of the expert 'paper'" in said
-    table = said[said.index("step  component") :].splitlines()
-    assert " ".join(table[0].split()) == "step component most likely probability exact probability recorded"
-    assert table[1].split()[4:6] == [
+    table = said[said.index("step  factor") :].splitlines()
+    assert " ".join(table[0].split()) == "step factor component most likely probability exact probability recorded"
+    assert table[1].split()[5:7] == [
         str(result["answers"][0]["exact"]["most_likely"]),
         f"{result['answers'][0]['exact']['probability']:.3f}",
     ]
@@ -149,7 +149,7 @@ def test_the_optimum_is_that_of_the_expert_that_is_named(tiny_policy):
 
 def test_only_doorkey_has_an_exact_optimum(tiny_policy, continuous_batch):
     batch = {key: value[:1] for key, value in continuous_batch.items()}
-    with pytest.raises(ValueError, match="Only DoorKey's"):
+    with pytest.raises(ValueError, match="no exact optimum 'paper'"):
         query.ask(tiny_policy("continuous"), "s[1] | s[0]", batch=batch, exact="paper")
 
 
@@ -157,7 +157,7 @@ def test_samples_follow_the_policy_and_count_what_was_rejected(ask, tiny_policy,
     flags = ("--mask=a[:3] | s[:4]", "--sample=50", "--order=backward", "--seed=4", "--check=dynamics")
     result = json.loads(ask(*flags, "--json", episode=0))
     drawn = tiny_policy().sample(
-        query.read_window(doorkey, 0), "a[:3] | s[:4]", samples=50, order="backward", seed=4, check=DynamicsCheck()
+        read_window(doorkey, 0), "a[:3] | s[:4]", samples=50, order="backward", seed=4, check=DynamicsCheck()
     )
     sampling = result["sampling"]
     assert {name: sampling[name] for name in ("samples", "order", "seed", "check")} == {
@@ -192,8 +192,7 @@ def test_continuous_answers_have_means_and_scales(tiny_policy, continuous_batch)
         assert row["recorded"] == pytest.approx(recorded[i].item())
     sampling = Sampling(20)
     reply = query.ask(policy, "s[1] | s[0]", batch=batch, sampling=sampling)
-    loaded = query.Loaded(policy, "p", None)
-    result = query.record(loaded, "s[1] | s[0]", reply, t=None, given=None, data=None, sampling=sampling)
+    result = query.record(policy, "s[1] | s[0]", reply, t=None, given=None, source=None, sampling=sampling)
     assert "±" in query.describe(json.loads(json.dumps(result)))
     assert query.rows(policy, query.ask(tiny_policy("continuous"), "s[1] | s[0]", batch=batch))[0]["scale"] is None
 
@@ -206,7 +205,7 @@ def test_without_a_mask_it_lists_what_can_be_asked(ask, tiny_policy):
     assert result["factors"]["a"] == [{"component": "direction", "categories": 4}]
     assert result["factors"]["rtg"][0].keys() == {"component", "mean", "std"}
     features = {key: value for key, value in DOORKEY.items() if key != "observation.return_to_go"}
-    tasks = query.overview(query.Loaded(tiny_policy(features=features), "p", None))["tasks"]
+    tasks = query.overview(tiny_policy(features=features))["tasks"]
     assert "reward_conditioned" not in [task["name"] for task in tasks]
 
 
@@ -237,8 +236,7 @@ def test_every_answer_can_be_drawn(flags, ask, tmp_path):
 
 
 def test_a_maze_is_drawn_with_the_walls_of_its_data(tiny_policy, tmp_path):
-    data = SimpleNamespace(root=tmp_path)
-    assert query.maze_of(data) == "medium"
+    source = query.Source(tmp_path, tmp_path, None, episode=0, start=0)
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "provenance.json").write_text('{"maze": "umaze"}')
     names = ["x", "y", "goal_x", "goal_y"]
@@ -250,7 +248,7 @@ def test_a_maze_is_drawn_with_the_walls_of_its_data(tiny_policy, tmp_path):
     stats = {key: {"mean": [0.0] * size, "std": [1.0] * size} for key, size in numbers.items()}
     policy = tiny_policy("continuous", features=features, stats=stats)
     reply = query.ask(policy, "s[1:] | s[0]", given={"s[0]": [1, 1, 2, 2]})
-    drawn = query.picture(policy, "s[1:] | s[0]", reply, maze=query.maze_of(data))
+    drawn = query.picture(policy, "s[1:] | s[0]", reply, source=source)
     assert len(drawn.axes[0].patches) == "".join(parse_maze("umaze").rows).count("#")
 
 
@@ -264,7 +262,9 @@ def test_with_json_only_the_json_is_printed(ask, tmp_path):
 def test_a_training_run_stands_for_its_last_checkpoint(tiny_policy, tmp_path):
     for updates in (10, 20):
         tiny_policy().save_pretrained(tmp_path / "checkpoints" / f"{updates:06}" / "pretrained_model")
-    assert query.load_policy(str(tmp_path)).path == str(tmp_path / "checkpoints" / "000020" / "pretrained_model")
+    assert UniMASKPolicy.from_pretrained(str(tmp_path)).origin.repository == str(
+        tmp_path / "checkpoints" / "000020" / "pretrained_model"
+    )
 
 
 def test_a_policy_of_the_hub_is_named_with_its_commit(tiny_policy, tmp_path, monkeypatch):
@@ -275,8 +275,7 @@ def test_a_policy_of_the_hub_is_named_with_its_commit(tiny_policy, tmp_path, mon
     monkeypatch.setattr(
         hub, "fetch", lambda repo_id, *, revision=None, **_: asked.append((repo_id, revision)) or folder
     )
-    loaded = query.load_policy("me/doorkey", "main")
-    assert (loaded.path, loaded.revision) == ("me/doorkey", commit)
+    assert UniMASKPolicy.from_pretrained("me/doorkey", revision="main").origin == ("me/doorkey", commit)
     assert asked == [("me/doorkey", "main")]
 
 
@@ -329,7 +328,7 @@ def test_a_wrong_policy_is_told(refused, tmp_path):
 
 def test_only_doorkey_offers_its_dynamics(tiny_policy, continuous_batch):
     batch = {key: value[:1] for key, value in continuous_batch.items()}
-    with pytest.raises(ValueError, match="Only DoorKey offers its dynamics"):
+    with pytest.raises(ValueError, match="offers no check 'dynamics'"):
         query.ask(tiny_policy("continuous"), "s[1] | s[0]", batch=batch, sampling=Sampling(2, check="dynamics"))
 
 
@@ -338,24 +337,24 @@ def test_only_doorkey_offers_its_dynamics(tiny_policy, continuous_batch):
 
 def test_goals_of_recorded_episodes_are_what_policy_given_takes(checkpoint, doorkey_root, doorkey, tiny_policy, capsys):
     flags = [f"--policy.path={checkpoint}", f"--dataset.root={doorkey_root}"]
-    cli.main(["given", *flags, "--episodes=2:5", "--tokens=s[3], s[-1], rtg[0]"])
+    cli.main(["given", *flags, "--dataset.episodes=2:5", "--tokens=s[3], s[-1], rtg[0]"])
     given = json.loads(capsys.readouterr().out)
     states = torch.stack([doorkey[10 * episode]["observation.state"] for episode in (2, 3, 4)])
     assert given["s[3]"] == states[:, 3].tolist()
     assert given["s[-1]"] == states[:, 9].tolist()
     policy = tiny_policy(inference_mask="a[t] | s[:t+1], a[:t], s[3], s[-1], rtg[0]", given=given)
     policy.select_action({"observation.state": states[:, 0].float()})
-    cli.main(["given", *flags, "--episodes=4"])
+    cli.main(["given", *flags, "--dataset.episodes=4"])
     assert json.loads(capsys.readouterr().out) == {"s[-1]": states[2:, 9].tolist()}
 
 
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        (["--episodes=20:40"], "this dataset's are 0 to 29"),
-        (["--episodes=few"], "write 0:50 or 3,5,7"),
-        (["--episodes=0:2", "--tokens=s[12]"], "its steps are 0 to 9"),
-        (["--episodes=0:2", "--tokens=goal"], "Expected '['"),
+        (["--dataset.episodes=20:40"], "this dataset's are 0 to 29"),
+        (["--dataset.episodes=few"], "write 0:50 or 3,5,7"),
+        (["--dataset.episodes=0:2", "--tokens=s[12]"], "its steps are 0 to 9"),
+        (["--dataset.episodes=0:2", "--tokens=goal"], "Expected '['"),
     ],
 )
 def test_goals_that_are_not_there_are_refused(flags, expected, checkpoint, doorkey_root, capsys):

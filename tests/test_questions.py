@@ -121,7 +121,7 @@ def test_every_measurement_is_in_the_record(doorkey_root, tmp_path, monkeypatch,
     )
     output = tmp_path / "results" / "questions.json"
     flags = [f"--policy.path={tmp_path / 'policy'}", f"--dataset.root={doorkey_root}", "--each=1", "--samples=30"]
-    cli.main(["questions", *flags, f"--output={output}"])
+    cli.main(["paper", "questions", *flags, f"--output={output}"])
     said, record = capsys.readouterr().out, json.loads(output.read_text())
     assert record["command"].startswith("unimask questions --policy.path=")
     assert record.keys() >= {"goals", "returns", "visits", "backward", "orders", "consistency", "versions", "training"}

@@ -22,8 +22,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader, Subset, default_collate
 from torch.utils.data._utils.pin_memory import pin_memory
 
+from lerobot_unimask import lerobot_patches
 from lerobot_unimask.data import reads
-from lerobot_unimask.data.reads import Item, Windows, install
+from lerobot_unimask.data.reads import Item, Windows
 
 FPS = 10
 K = 10
@@ -47,7 +48,7 @@ DELTAS = {
 
 @pytest.fixture(autouse=True, scope="module")
 def installed():
-    install()
+    lerobot_patches.apply()
 
 
 def write(root, features=FEATURES, lengths=LENGTHS):
@@ -240,7 +241,7 @@ def assert_read_item_by_item(dataset):
 
 
 def test_the_environment_turns_it_off(root, monkeypatch):
-    monkeypatch.setenv("UNIMASK_BATCHED_READS", "0")
+    monkeypatch.setattr(LeRobotDataset, "__getitems__", None)
     assert_read_item_by_item(load(root))
 
 
@@ -299,7 +300,7 @@ def test_a_dataset_just_recorded_is_read_in_batches(tmp_path):
 def test_lerobots_own_getitems_stays(monkeypatch):
     own = SimpleNamespace(__getitems__="LeRobot's own")
     monkeypatch.setattr(reads, "LeRobotDataset", own)
-    install()
+    lerobot_patches.apply()
     assert vars(own) == {"__getitems__": "LeRobot's own"}
 
 

@@ -136,12 +136,12 @@ def test_bad_settings_are_named(tmp_path, capsys):
     ):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(SystemExit):
-            cli.main(["search", f"--config_path={tmp_path / 'bad.yaml'}"])
+            cli.main(["paper", "search", f"--config_path={tmp_path / 'bad.yaml'}"])
         assert message in capsys.readouterr().err
 
 
 def test_the_quick_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    cli.main(["search", f"--config_path={CONFIGS / 'search_quick.yaml'}"])
+    cli.main(["paper", "search", f"--config_path={CONFIGS / 'search_quick.yaml'}"])
     record = json.loads(Path("outputs/search_quick/search_quick.json").read_text())
     assert record["best"].keys() == record["config"]["variants"].keys()

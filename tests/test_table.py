@@ -41,14 +41,14 @@ def test_bad_settings_are_named(tmp_path, capsys):
     ):
         (tmp_path / "bad.yaml").write_text(text)
         with pytest.raises(SystemExit):
-            cli.main(["table", f"--config_path={tmp_path / 'bad.yaml'}"])
+            cli.main(["paper", "table", f"--config_path={tmp_path / 'bad.yaml'}"])
         assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_the_two_minute_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    cli.main(["table", f"--config_path={CONFIGS / 'maze_table_quick.yaml'}", "--workers=2"])
+    cli.main(["paper", "table", f"--config_path={CONFIGS / 'maze_table_quick.yaml'}", "--workers=2"])
     record = json.loads(Path("outputs/maze_table_quick/table.json").read_text())
     assert set(record["returns"]["unimask_random_mask"]) == {"k5_bc", "k5_rc"}
     assert record["returns"].keys() == set(read_config(TableConfig, CONFIGS / "maze_table_quick.yaml").rows)

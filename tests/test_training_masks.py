@@ -327,15 +327,6 @@ def test_the_share_of_causal_windows_is_as_asked_and_the_others_are_as_without()
     assert conditioned == pytest.approx(0.5, abs=0.11)
 
 
-def test_an_update_can_draw_its_direction_together():
-    valid, index = torch.ones(50, 4, dtype=torch.bool), torch.arange(50)
-    drawn = TrainingMasks("random_mask", ("s", "a"), 4, causal_share=0.25, causal_draw="update")
-    directions = [drawn(valid, index, seed=0, step=step).causal for step in range(400)]
-    assert all(causal.unique().numel() == 1 for causal in directions)
-    share = torch.stack(directions)[:, 0].float().mean().item()
-    assert share == pytest.approx(0.25, abs=5 * (0.1875 / 400) ** 0.5)
-
-
 def test_without_a_causal_form_nothing_is_causal_or_the_mask_is_refused():
     _, mask = causal_masks("past", share=0.5)
     assert mask.causal is False

@@ -1,8 +1,6 @@
-"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+"""Values that a user gives for single tokens of a window, `{"s[-1]": [15, 15], "rtg[0]": 5}`, read and checked.
 
-Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
-
-Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+Legend of shapes: B windows or environments, K steps, D the numbers of a factor.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,30 +11,51 @@ from torch import Tensor
 
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
-from lerobot_unimask.language.masks import Mask, parse_token
+from lerobot_unimask.language.masks import Mask, Token, parse_token
 
 Given = Mapping[str, Any]  # token text -> its value, shared (D,) or one per environment (B, D); a number where D = 1
 
 
 def read_given(
     given: Given, factors: Mapping[str, Factor], context_length: int, batch_size: int | None = None
-) -> dict[tuple[str, int], Tensor]:
-    """Check what a user gives: (factor, position) -> (B, D) or (1, D), D as the user counts it, without computed parts.
+) -> dict[Token, Tensor]:
+    """Check what a user gives: token -> (B, D) or (1, D), D as the user counts it, without computed parts.
 
     Args:
         batch_size: B; None where it is not known yet, and any number of rows will do.
 
     Raises:
-        MaskError: a key that is not a token of the window.
+        MaskError: a key that is not a token.
         ValueError: a value of the wrong size, not finite, or not one of the categories.
     """
-    tokens = {}
+    tokens: dict[Token, Tensor] = {}
     for text, value in given.items():
-        name, step = parse_token(text, tuple(factors), context_length)
-        if (name, step) in tokens:
-            raise ValueError(f"{name}[{step}] is given twice, the second time as {text}.")
-        tokens[name, step] = _token(text, value, factors[name], batch_size)
+        token = parse_token(text, tuple(factors), context_length)
+        if token in tokens:
+            raise ValueError(f"{token} is given twice, the second time as {text}.")
+        tokens[token] = _token(text, value, factors[token.factor], batch_size)
     return tokens
+
+
+def in_window(
+    tokens: Mapping[Token, Tensor], first_step: int, context_length: int, horizon: int | None = None
+) -> dict[tuple[str, int], Tensor]:
+    """(factor, position) -> value, of the tokens that lie in a window that begins at an episode's step `first_step`.
+
+    Args:
+        horizon: steps of the longest episode.
+
+    Raises:
+        ValueError: a step that no episode has.
+    """
+    here = {}
+    for token, value in tokens.items():
+        if token.of_episode and horizon is not None and token.step >= horizon:
+            raise ValueError(f"{token} is given, but the longest episode has {horizon} steps, 0 to {horizon - 1}.")
+        position = token.step - first_step if token.of_episode else token.step
+        if 0 <= position < context_length:
+            here[token.factor, position] = value
+    return here
 
 
 def give(
@@ -45,7 +64,7 @@ def give(
     """The window with the given tokens where nothing has been observed, and which tokens are known then.
 
     Args:
-        tokens: as `read_given` returns them.
+        tokens: (factor, position) -> value, as `in_window` returns them.
         known: factor -> (K,) bool, True where the window holds an observed value, which wins over a given one.
     """
     values, known = dict(window.values), dict(known)
@@ -97,17 +116,18 @@ def check_values(what: str, values: Tensor, factor: Factor) -> None:
                 )
 
 
-def check_shown(tokens: Iterable[tuple[str, int]], shown: Mapping[str, Tensor], text: str) -> None:
-    """A given token must be one that the mask shows, (..., K) bool for each factor, or giving it changes nothing.
+def check_shown(tokens: Iterable[Token], shown: Mapping[str, Tensor], text: str) -> None:
+    """A given token of the window must be one that the mask shows, (..., K) bool for each factor, or giving it changes
+    nothing.
 
     Raises:
         ValueError: the mask does not show it.
     """
-    for name, step in tokens:
-        if not shown[name][..., step].any():
+    for token in tokens:
+        if not token.of_episode and not shown[token.factor][..., token.step].any():
             raise ValueError(
-                f"{name}[{step}] is given, but the mask does not show it:\n  {text}\n"
-                f"Add {name}[{step}] after the bar, or do not give it."
+                f"{token} is given, but the mask does not show it:\n  {text}\n"
+                f"Add {token} after the bar, or do not give it."
             )
 
 

@@ -1,8 +1,6 @@
-"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+"""What acting remembers of the episodes that run side by side.
 
-Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
-
-Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+Legend of shapes: B environments, K steps, D the numbers of a factor.
 """
 
 from collections.abc import Mapping
@@ -17,27 +15,41 @@ from lerobot_unimask.networks.layers import Cache
 
 
 class RolloutMemory:
-    """The last K states and actions of each environment in a batch, and the return each had received by then.
+    """The last states and actions of each environment in a batch, and the return that each had received by then.
 
-    The present stands at position min(step, K - 1): before the window is full, later positions are empty; then it
-    slides.
+    The present stands at position min(step, last_position) of the window. Positions after it are empty; once it stands
+    at the last one, the window slides.
+
+    Args:
+        context_length: K.
+        batch_size: B.
+        last_position: position where the present stops, K - 1 or less; None: K - 1.
     """
 
     @torch.inference_mode(False)
-    def __init__(self, factors: Mapping[str, Factor], context_length: int, batch_size: int, device: torch.device):
+    def __init__(
+        self,
+        factors: Mapping[str, Factor],
+        context_length: int,
+        batch_size: int,
+        device: torch.device,
+        last_position: int | None = None,
+    ):
         K = context_length
+        self.last_position = K - 1 if last_position is None else last_position
         self.step = -1  # of the episode; nothing has been observed yet
         self.acted = True  # the step has ended, so that the next observation begins another
         self.values = {name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()}
         self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
-        self.target_return: Tensor | None = None  # (B, 1) or (1, 1): asked for from the first step on
+        self.first_state: Tensor | None = None  # (B, D)
+        self.planned: list[Tensor] = []  # actions of a chunk that are still to be carried out, each (B, D)
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
         self.cache = Cache()  # of the steps in the window, until it slides
 
     @property
     def position(self) -> int:
         """Where the present stands in the window."""
-        return min(self.step, self.valid.shape[1] - 1)
+        return min(self.step, self.last_position)
 
     @property
     def first_step(self) -> int:
@@ -50,16 +62,18 @@ class RolloutMemory:
 
         Where the last step found no action, because its question was refused, it begins again.
         """
-        K = self.valid.shape[1]
         if self.acted:
             self.step += 1
-            if self.step >= K:
+            if self.step > self.last_position:
                 for name in ASKABLE:
                     self.values[name] = self.values[name].roll(-1, dims=1)
                 self.return_so_far = self.return_so_far.roll(-1, dims=1)
                 self.cache = Cache()
             self.acted = False
-        self.values["s"][:, self.position] = state.clone()
+        state = state.clone()
+        if self.step == 0:
+            self.first_state = state
+        self.values["s"][:, self.position] = state
         self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
 
     @torch.inference_mode(False)
@@ -90,7 +104,7 @@ class RolloutMemory:
             window.values["rtg"][:, 1:, 0] = window.values["rtg"][:, :1, 0] - received
 
     def remaining(self, target_return: Tensor) -> Tensor:
-        """What is left of the target return at the window's first step, (B, 1).
+        """What is left of the target return, (B, 1) or (1, 1), at the window's first step: (B, 1).
 
         Raises:
             ValueError: the window has slid and the environment never reported the return so far.
@@ -99,8 +113,11 @@ class RolloutMemory:
             return target_return.expand(len(self.valid), 1)
         received = self.return_so_far[:, :1]
         if received.isnan().any():
-            raise ValueError(
-                "Asking for a return needs the environment to report what it has paid so far, as "
-                "'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
-            )
+            raise ValueError(NO_RETURN_SO_FAR)
         return target_return - received
+
+
+NO_RETURN_SO_FAR = (
+    "Asking for a return over an episode that is longer than the window needs the environment to report what it has "
+    "paid so far, as 'observation.return_so_far' (an array 'return_so_far' of shape (1,) in its observations)."
+)

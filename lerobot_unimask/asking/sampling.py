@@ -1,8 +1,6 @@
-"""Answering questions: distributions of the asked-for tokens, samples by the chain rule, and a rollout's memory.
+"""Samples by the chain rule: asked tokens drawn one after another, each given the shown ones and those drawn before it.
 
-Acting is a question asked at every step, so everything here goes through `answer`; there is no second path.
-
-Legend of shapes: B windows or environments, K steps, D the dimensions of a factor.
+Legend of shapes: B windows, K steps, D the numbers of a factor, n some of the windows.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,9 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lerobot_unimask.asking.answers import Predict, answer
-from lerobot_unimask.data.factors import Factor
-from lerobot_unimask.data.window import Statistics, Window
+from lerobot_unimask.asking.answers import Model, answer
+from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE, Mask
 
 ORDERS = ("forward", "backward", "random")
@@ -46,9 +43,7 @@ class Samples(Window):
 
 
 def sample(
-    predict: Predict,
-    statistics: Statistics,
-    factors: Mapping[str, Factor],
+    model: Model,
     window: Window,
     mask: Mask,
     *,
@@ -105,8 +100,8 @@ def sample(
             here = torch.zeros_like(shown[name])
             here[:, step] = mask.asked[name][rows, step]
             nothing = {other: torch.zeros_like(here) for other in shown}
-            posed = Mask(shown, nothing | {name: here})
-            said = answer(predict, statistics, factors, Window(values, samples.valid[rows]), posed)
+            question = Mask(shown, nothing | {name: here})
+            said = answer(model, Window(values, samples.valid[rows]), question)
             shown = shown | {name: shown[name] | here}
             redraw = here[:, step].nonzero().squeeze(-1)
             for _ in range(tries):
@@ -140,3 +135,23 @@ def sample(
 
 def _rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
     return {name: tensor[rows] for name, tensor in tensors.items()}
+
+
+def check_count(samples: int) -> int:
+    """
+    Raises:
+        ValueError: not a number of samples.
+    """
+    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
+        raise ValueError(f"samples is {samples!r}; draw at least 1.")
+    return samples
+
+
+def make_generator(seed: int, device: torch.device) -> torch.Generator:
+    """
+    Raises:
+        ValueError: a seed that torch does not take.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed is {seed!r}; give a whole number from 0 to 2^63 - 1.")
+    return torch.Generator(device).manual_seed(seed)

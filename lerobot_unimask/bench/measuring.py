@@ -7,19 +7,12 @@ been tried for want of one.
 """
 
 import ctypes
-import functools
-import multiprocessing
 import os
 import platform
-import resource
-import subprocess
-import sys
 import tempfile
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -42,14 +35,14 @@ from torch.utils.data import default_collate
 
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import HORIZON, build_maze2d, building_seconds, stepping_seconds
+from lerobot_unimask import evaluating as lerobot_evaluation
+from lerobot_unimask.bench.clock import Stopwatch, alone, commit, machine, now, spread
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.data import reads
 from lerobot_unimask.data.factors import RETURN_SO_FAR
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.transformer import Transformer
-from lerobot_unimask.paper import learning_curve
 from lerobot_unimask.records import versions
 from lerobot_unimask.training import Trainer
 
@@ -126,7 +119,7 @@ def bench(configs: Path, *, quick: bool = False) -> dict[str, Any]:
         "quick": quick,
         "machine": machine(),
         "load_at_start": round(load, 2),  # processes that wanted a core: above 0 other work disturbed what follows
-        "commit": _commit(),
+        "commit": commit(),
         "versions": versions(),
     }
     with tempfile.TemporaryDirectory() as folder:
@@ -205,64 +198,6 @@ def _growth(size: Size, policy: Mapping[str, Any], folder: Path) -> dict[str, li
     return found
 
 
-def alone(label: str, measure: Callable[..., dict[str, Any]], *arguments: Any, **keywords: Any) -> dict[str, Any]:
-    """What a function of this module returns in a process of its own, with that process's seconds and peak memory."""
-    print(f"{label} ...", file=sys.stderr, flush=True)
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    with ProcessPoolExecutor(1, mp_context=context) as process:
-        return process.submit(_measured, functools.partial(measure, *arguments, **keywords)).result()
-
-
-def _measured(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    began = time.monotonic()
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        record = measure()
-    record["seconds"] = round(time.monotonic() - began, 1)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB; on macOS bytes
-    record["peak_memory_mib"] = round(peak / (2**20 if sys.platform == "darwin" else 2**10))
-    if torch.cuda.is_initialized():
-        record["peak_device_memory_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
-    return record
-
-
-class Stopwatch:
-    """When named pieces of work began and how many seconds they took, every time that they were done."""
-
-    def __init__(self) -> None:
-        self.began: dict[str, list[float]] = defaultdict(list)
-        self.seconds: dict[str, list[float]] = defaultdict(list)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        began = _now()
-        yield
-        self.began[name].append(began)
-        self.seconds[name].append(_now() - began)
-
-    def wrap(self, owner: Any, attribute: str, name: str) -> None:
-        """Time every call of a function from now on, for as long as this process lives."""
-        function = getattr(owner, attribute)
-
-        @functools.wraps(function)
-        def timed(*arguments: Any, **keywords: Any) -> Any:
-            with self(name):
-                return function(*arguments, **keywords)
-
-        setattr(owner, attribute, timed)
-
-
-def _now() -> float:
-    if torch.cuda.is_initialized():
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
-def spread(values: Sequence[float]) -> dict[str, Any]:
-    low, median, high = np.quantile(np.asarray(values, dtype=float), [0.25, 0.5, 0.75]).tolist()
-    return {"median": median, "quartiles": [low, high], "repeats": len(values)}
-
-
 def nothing() -> dict[str, Any]:
     """What importing alone occupies."""
     return {}
@@ -317,7 +252,7 @@ def training(
         libc.mallopt(mmap_threshold, 2**25)
         libc.mallopt(trim_threshold, 10**9)
     if not batched_reads:
-        os.environ[reads.ENVIRONMENT_VARIABLE] = "0"
+        LeRobotDataset.__getitems__ = None  # in this process, which measures nothing else
     with tempfile.TemporaryDirectory() as folder:
         overrides = {
             "dataset.root": root,
@@ -403,11 +338,11 @@ def evaluating(settings: Mapping[str, Any], root: Path, rollouts: int) -> dict[s
     watch.wrap(Transformer, "forward", "forward")
     watch.wrap(UniMASKPolicy, "select_action", "acting")
     watch.wrap(Maze2DEnv, "step", "environment")
-    watch.wrap(learning_curve, "eval_policy_all", "evaluation")
+    watch.wrap(lerobot_evaluation, "eval_policy_all", "evaluation")
     count = min(100, rollouts)
     with tempfile.TemporaryDirectory() as folder, _autocast(policy.config):
         policy.save_pretrained(folder)
-        learning_curve.rollouts(Path(folder), "maze2d", rollouts, batch_size=count, seed=0)
+        lerobot_evaluation.rollout(Path(folder), "maze2d", rollouts, batch_size=count, seed=0)
     total, acting, forward, environment = (
         1000 * sum(watch.seconds[name]) / rollouts for name in ("evaluation", "acting", "forward", "environment")
     )
@@ -435,7 +370,7 @@ def updating(settings: Mapping[str, Any], root: Path, batch_size: int, updates: 
     """Milliseconds of an update, read, drawn and made."""
     settings = {name: value for name, value in settings.items() if name != "type"}
     trainer = Trainer(settings, root, seed=0, steps=updates + WARM_UP, batch_size=batch_size)
-    ends = [_now() for _ in trainer]
+    ends = [now() for _ in trainer]
     return {"step_ms": spread(1000 * np.diff(ends)[WARM_UP - 1 :])}
 
 
@@ -448,27 +383,3 @@ def _maze_policy(settings: Mapping[str, Any], root: Path) -> UniMASKPolicy:
 def _autocast(config: PreTrainedConfig) -> torch.autocast:
     """As lerobot-eval has it."""
     return torch.autocast(torch.device(config.device).type, enabled=config.use_amp)
-
-
-def machine() -> dict[str, Any]:
-    cpuinfo = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in _lines(cpuinfo) if line.startswith("model name")]
-    return {
-        "processor": names[0] if names else platform.processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "system": platform.platform(),
-    }
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
-
-
-def _commit() -> str | None:
-    """The repository's commit, with `-dirty` where files have been changed since; None: it is no repository."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
-    return done.stdout.strip() if done.returncode == 0 else None

@@ -1,10 +1,4 @@
-"""`unimask bench`: how fast this machine reads, trains, acts, evaluates and builds, each beside its baseline.
-
-Every measurement runs in a process of its own, so that its peak memory is its own. These processes are forked from one
-that has imported everything and computed nothing; what such a process occupies is in the record as `imports`. Weights
-are untrained, which costs the same. With a GPU, clocks wait for it and its peak memory is recorded too; that has not
-been tried for want of one.
-"""
+"""The tables of a record of `unimask bench`."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -1,39 +1,58 @@
-"""Validation losses of a trained policy, task by task: the rows of the paper's heatmap (paper, appendix F).
+"""Checkpoints of a training run: which there are, and what was saved beside their weights."""
 
-A task's loss is the mean cross-entropy of each component (agent cell, key cell, action) over all asked-for tokens of
-all windows, the components added up. One window for each episode, from its first step, with t uniform; the windows and
-their masks are the same for every policy.
-"""
-
-import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
 
 from lerobot_unimask.data.episodes import provenance_of
+from lerobot_unimask.records import read_json
+
+CONFIG, WEIGHTS = "config.json", "model.safetensors"  # lerobot's names, in this order of being written
 
 
 def checkpoints_of(run: Path) -> list[Path]:
-    """A training run's checkpoints in order, or the folder itself if it is a checkpoint.
+    """A training run's whole checkpoints in the order of their updates, or the folder itself if it is a checkpoint.
 
     Raises:
         FileNotFoundError: it is neither.
     """
-    if (run / "config.json").exists():
+    if (run / CONFIG).exists():
         return [run]
-    found = sorted(path.parent for path in run.glob("checkpoints/*/pretrained_model/config.json"))
-    found = [path for path in found if path.parent.name != "last"]  # a link to one of the others
+    found = [path.parent for path in run.glob(f"checkpoints/*/pretrained_model/{WEIGHTS}")]
+    found = [path for path in found if path.parent.name.isdecimal() and (path / CONFIG).exists()]
     if not found:
         raise FileNotFoundError(
             f"{run} is neither a checkpoint (a folder with config.json) nor a training run (with checkpoints/)."
         )
-    return found
+    return sorted(found, key=lambda path: int(path.parent.name))
 
 
-def training_settings(checkpoint: Path) -> dict | None:
+def last_checkpoint(run: Path) -> Path:
+    """The checkpoint that a run's `last` points to; LeRobot sets it once all of a checkpoint has been written.
+
+    Raises:
+        FileNotFoundError: it is neither a training run nor a checkpoint.
+    """
+    last = run / "checkpoints" / "last" / "pretrained_model"
+    if not (run / CONFIG).exists() and (last / CONFIG).exists():
+        return last.parent.resolve() / last.name
+    return checkpoints_of(run)[-1]
+
+
+def _train_config(checkpoint: str | Path) -> dict[str, Any] | None:
+    path = Path(checkpoint) / "train_config.json"
+    return read_json(path) if path.exists() else None
+
+
+def training_settings(checkpoint: str | Path) -> dict[str, Any] | None:
     """What lerobot-train saved beside the weights: the policy's settings, the seed, the data and its provenance."""
-    path = checkpoint / "train_config.json"
-    if not path.exists():
+    config = _train_config(checkpoint)
+    if config is None:
         return None
-    config = json.loads(path.read_text())
     root = config["dataset"].get("root")
     keep = ("seed", "batch_size", "steps")
     policy = {
@@ -41,4 +60,48 @@ def training_settings(checkpoint: Path) -> dict | None:
     }
     for unrelated in ("input_features", "output_features", "features", "normalization_mapping", "pretrained_path"):
         policy.pop(unrelated, None)
-    return {**{key: config[key] for key in keep}, "policy": policy, "data": provenance_of(Path(root)) if root else None}
+    provenance = provenance_of(Path(root)) or None if root else None
+    return {**{key: config[key] for key in keep}, "policy": policy, "data": provenance}
+
+
+def was_trained_on(checkpoint: str | Path, root: Path, repo_id: str | None) -> bool:
+    """Whether a checkpoint's training read this dataset, by its folder or its name on the Hub."""
+    data = (_train_config(checkpoint) or {}).get("dataset") or {}
+    if data.get("root"):
+        return Path(data["root"]).resolve() == root.resolve()
+    return repo_id is not None and data.get("repo_id") == repo_id
+
+
+def read_weights(file: Path) -> dict[str, Tensor]:
+    """
+    Raises:
+        ValueError: the file is not one of safetensors.
+    """
+    try:
+        return load_file(file, device="cpu")
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{file} cannot be read as safetensors: {error}") from error
+
+
+def check_weights(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], model_file: str) -> None:
+    """
+    Raises:
+        ValueError: names every tensor that is missing, too many, of another shape or type, or not finite, and every
+            standard deviation that is not positive.
+    """
+    faults = [f"missing {name}" for name in expected if name not in weights]
+    faults += [f"extra {name}" for name in weights if name not in expected]
+    for name, tensor in expected.items():
+        found = weights.get(name)
+        if found is None:
+            continue
+        if found.shape != tensor.shape:
+            faults.append(f"{name} has shape {tuple(found.shape)} instead of {tuple(tensor.shape)}")
+        elif found.is_floating_point() != tensor.is_floating_point() or found.is_complex():
+            faults.append(f"{name} has type {found.dtype} instead of {tensor.dtype}")
+        elif not found.isfinite().all():
+            faults.append(f"{name} holds numbers that are not finite")
+        elif name.startswith("statistics.") and name.endswith(("_std", "horizon", "fps")) and not (found > 0).all():
+            faults.append(f"{name} holds numbers that are not positive")
+    if faults:
+        raise ValueError(f"The weights in {model_file} are not those of its config: {'; '.join(faults)}.")

@@ -37,6 +37,7 @@ class Component:
     categories: int | None  # None: continuous
     computed: bool = False  # by this package, not stored in the dataset or given by a user
     gaussian: bool = False  # continuous, predicted as a mean and a scale
+    names: tuple[str, ...] = ()  # of its numbers
 
     @property
     def discrete(self) -> bool:
@@ -81,18 +82,31 @@ def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = 
             if feature.categories is None:
                 label = feature.key.removeprefix("observation.")
                 dims = slice(start, start + feature.size)
-                components.append(Component(label, dims, None, gaussian=gaussian))
+                components.append(Component(label, dims, None, gaussian=gaussian, names=_names(feature)))
             else:
-                labels = feature.names or [
-                    f"{feature.key.removeprefix('observation.')}.{i}" for i in range(feature.size)
-                ]
-                for i, (label, count) in enumerate(zip(labels, feature.categories, strict=True)):
-                    components.append(Component(label, slice(start + i, start + i + 1), count))
+                for i, (label, count) in enumerate(zip(_names(feature), feature.categories, strict=True)):
+                    components.append(Component(label, slice(start + i, start + i + 1), count, names=(label,)))
             start += feature.size
         if name == "rtg":  # the token is the pair (return-to-go, timestep / horizon)
             components.append(Component("timestep", slice(start, start + 1), None, computed=True))
         factors[name] = Factor(name, tuple(components))
     return factors
+
+
+def _names(feature: Feature) -> tuple[str, ...]:
+    """A name for each number of a column, the dataset's own where it has them."""
+    plain = feature.key.removeprefix("observation.")
+    return tuple(feature.names or ([plain] if feature.size == 1 else [f"{plain}.{i}" for i in range(feature.size)]))
+
+
+def _flat_names(names: Any) -> list[str]:
+    """Names as `info.json` has them, some nested one deep: `[["a", "b"]]`, `{"motors": ["a", "b"]}`."""
+    if isinstance(names, Mapping):
+        names = list(names.values()) if any(isinstance(part, list) for part in names.values()) else list(names)
+    flat = []
+    for part in names if isinstance(names, list | tuple) else []:
+        flat += part if isinstance(part, list | tuple) else [part]
+    return [str(name) for name in flat]
 
 
 def is_numeric(entry: dict[str, Any]) -> bool:
@@ -104,9 +118,10 @@ def read_feature(key: str, entry: dict[str, Any]) -> Feature:
     categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
     if categories is not None and len(categories) != size:
         raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
-    names = entry.get("names")
-    names = list(names) if isinstance(names, list | tuple) and len(names) == size else None
-    return Feature(key, size, list(categories) if categories is not None else None, names)
+    names = _flat_names(entry.get("names"))
+    return Feature(
+        key, size, list(categories) if categories is not None else None, names if len(names) == size else None
+    )
 
 
 def declared_feature(key: str, feature: PolicyFeature) -> Feature:

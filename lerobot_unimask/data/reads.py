@@ -2,16 +2,14 @@
 
 LeRobotDataset reads item by item, 7 to 11 ms for a window of ten steps. Here a batch of windows of a dataset without
 cameras is gathered by index from the columns, which stay in the files that `datasets` has memory-mapped; it is equal in
-keys, dtypes, shapes and values to the items read one by one and collated. `install()` adds this to LeRobotDataset;
-importing `lerobot_unimask` calls it. `UNIMASK_BATCHED_READS=0` in the environment turns it off. Oracle:
-`tests/test_reads.py`.
+keys, dtypes, shapes and values to the items read one by one and collated. `lerobot_patches.py` adds this to
+LeRobotDataset. Oracle: `tests/test_reads.py`.
 
 Shapes: N frames, in P pieces; B windows, K steps (one for each of a key's deltas), E episodes.
 """
 
 import math
 import operator
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,17 +19,11 @@ import datasets
 import numpy as np
 import pyarrow as pa
 import torch
-from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import factory
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.io_utils import hf_transform_to_torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from torch.utils.data._utils.collate import collate, default_collate_fn_map
-
-ENVIRONMENT_VARIABLE = "UNIMASK_BATCHED_READS"
-
-_lerobots_make_dataset = factory.make_dataset
+from torch.utils.data._utils.collate import collate
 
 
 class Item(dict):
@@ -198,7 +190,7 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
             if (columns.columns["index"].take(taken, columns.pieces_of(taken)) != absolute).any():
                 raise KeyError(
                     "a window reaches a frame of its episode that is not loaded, or not in its place; "
-                    f"{ENVIRONMENT_VARIABLE}=0 reads frames one by one, wherever they are"
+                    "UNIMASK_PATCH_LEROBOT=0 reads frames one by one, wherever they are"
                 )
         steps[deltas] = taken, columns.pieces_of(taken), wanted != absolute
 
@@ -215,11 +207,11 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
 def batched_read(dataset: LeRobotDataset) -> Callable[[Iterable[int]], Windows] | None:
     """`dataset.__getitems__`, or None where items must be read one by one, which PyTorch then does.
 
-    That is: turned off by the environment; a subclass that reads items its own way; a dataset being recorded; one with
+    That is: a subclass that reads items its own way; a dataset being recorded; one with
     cameras or any other column that is not plain numbers; one whose frames the user has given another transform; deltas
     that LeRobot refuses.
     """
-    if os.environ.get(ENVIRONMENT_VARIABLE) == "0" or type(dataset).__getitem__ is not LeRobotDataset.__getitem__:
+    if type(dataset).__getitem__ is not LeRobotDataset.__getitem__:
         return None
     if (dataset.writer is not None and not dataset._is_finalized) or dataset.meta.camera_keys:
         return None
@@ -234,43 +226,3 @@ def batched_read(dataset: LeRobotDataset) -> Callable[[Iterable[int]], Windows] 
     if reader.delta_indices is not None and not reader.delta_indices.keys() <= columns.columns.keys() - {"task_index"}:
         return None
     return partial(gather, columns, reader)
-
-
-def make_dataset(cfg: TrainPipelineConfig) -> LeRobotDataset:
-    """LeRobot's `make_dataset`, which `lerobot-train` calls; refuses to stream windows to this policy.
-
-    Note: LeRobot 0.6.1's streams fail on windows of a feature of shape (1,), give nothing at all, and wait for ever,
-    with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`.
-
-    Raises:
-        ValueError: a unimask policy and `--dataset.streaming=true`.
-    """
-    if cfg.dataset.streaming and cfg.trainable_config.type == "unimask":
-        raise ValueError(
-            "unimask does not train on streamed datasets: LeRobot's streams do not give it whole windows. Leave out "
-            "--dataset.streaming: the columns are memory-mapped, and ten million frames need no more than 2 GB. A "
-            "dataset in a bucket has to be downloaded first, and named with --dataset.root."
-        )
-    return _lerobots_make_dataset(cfg)
-
-
-class _InstallWhereUnpickled:
-    """Travels in a pickled dataset: spawned DataLoader workers import no plugin, but unpickle the dataset."""
-
-    def __reduce__(self):
-        return install, ()
-
-
-def install() -> None:
-    """Give LeRobotDataset a `__getitems__`, here and in processes that its datasets are pickled to, and have
-    lerobot-train refuse streams.
-
-    Does nothing the second time, or where LeRobot has a `__getitems__` of its own.
-    """
-    if hasattr(LeRobotDataset, "__getitems__"):
-        return
-    factory.make_dataset = make_dataset
-    state_of = LeRobotDataset.__getstate__
-    LeRobotDataset.__getitems__ = property(batched_read)
-    LeRobotDataset.__getstate__ = lambda self: {**state_of(self), "_batched_read": _InstallWhereUnpickled()}
-    default_collate_fn_map[Item] = collate_windows

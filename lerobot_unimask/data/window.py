@@ -1,6 +1,7 @@
-"""LeRobot batch -> Window: the factors of K steps as tensors, in the dataset's units.
+"""A LeRobot batch -> a `Window`: the factors of K steps as tensors, in the dataset's units; and those units'
+statistics.
 
-Legend of shapes: B windows, K steps, D the dimensions of a factor.
+Legend of shapes: B windows, K steps, D the numbers of a factor.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,10 +1,7 @@
-"""The mask language, the table of named tasks, and the masks of a batch. `training_masks.py` draws them for training.
+"""The grammar of the mask language: a text becomes a `Question`, or an error that shows where it does not.
 
-A question is written in the paper's own notation, P(what is asked | what is shown), over a window of K steps:
-`a[t] | s[:t+1], a[:t]` is behaviour cloning. Here such a text becomes a boolean table with one row for each t that it
-admits; a mask for a batch is a choice of rows. A mask is boolean and True means: the model may see it.
-
-Legend of shapes: B windows, K steps, F factors, R rows (one for each admissible t of each task).
+A question is written in the paper's own notation, P(what is asked | what is shown): `a[t] | s[:t+1], a[:t]`. Nothing
+of the text is ever evaluated.
 """
 
 import re
@@ -49,6 +46,7 @@ class Term:
     factor: str
     steps: tuple[Index | Slice, ...]
     position: int
+    of_episode: bool = False  # `s@150`, a step of the episode; of single tokens alone
 
 
 @dataclass(frozen=True)
@@ -70,14 +68,15 @@ class Question:
         return any(bound.relative for bound in bounds)
 
 
-_TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<integer>\d+)|(?P<symbol>[\[\]:,+\-|]))")
+_TOKEN = re.compile(r"\s*(?:(?P<name>[A-Za-z_]\w*)|(?P<integer>\d+)|(?P<symbol>[\[\]:,+\-|@]))")
 
 
 class _Parser:
     """Recursive descent over `terms | terms`; nothing of the text is ever evaluated."""
 
-    def __init__(self, text: str):
+    def __init__(self, text: str, *, single: bool = False):
         self.text = text
+        self.single = single  # a token to be given, not a question
         self.tokens: list[tuple[str, str, int]] = []  # (kind, text, position)
         end = len(text.rstrip())
         at = 0
@@ -128,6 +127,9 @@ class _Parser:
         if name == "t":
             raise MaskError("'t' is the step, not a factor: write a[t] or s[t].", self.text, position)
         self.next += 1
+        if self.single and self.accept("@"):
+            index = Index(self.integer("+"), False, position)
+            return Term(name, (index,), position, of_episode=True)
         if not self.accept("["):
             self.fail(f"'[' after {name}: factors are always indexed, as in {name}[0]")
         steps = [self.steps()]
@@ -172,8 +174,31 @@ class _Parser:
         return -int(token) if sign == "-" else int(token)
 
 
-def _check_text(text: str) -> None:
+def check_text(text: str) -> None:
     if not isinstance(text, str):
         raise TypeError(f"A mask is written as text, such as 'a[t] | s[:t+1], a[:t]'; got {type(text).__name__}.")
     if len(text) > MAX_TEXT:
         raise MaskError(f"A mask text has at most {MAX_TEXT} characters, this one has {len(text)}.", text[:60] + " ...")
+
+
+def parse_question(text: str) -> Question:
+    """
+    Raises:
+        MaskError: the text does not parse.
+    """
+    check_text(text)
+    return _Parser(text).question()
+
+
+def parse_terms(text: str) -> tuple[Term, ...]:
+    """The terms of a text without a bar, as of a token that is given.
+
+    Raises:
+        MaskError: the text does not parse.
+    """
+    check_text(text)
+    parser = _Parser(text, single=True)
+    terms = parser.terms()
+    if parser.tokens[parser.next][0] != "end":
+        parser.fail("the end of the text")
+    return terms

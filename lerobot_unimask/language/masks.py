@@ -12,11 +12,21 @@ import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lerobot_unimask.language.grammar import Index, MaskError, Question, Slice, Term, _check_text, _Parser
+from lerobot_unimask.language.grammar import (
+    Index,
+    MaskError,
+    Question,
+    Slice,
+    Term,
+    check_text,
+    parse_question,
+    parse_terms,
+)
 
 # Paper, appendix "Training regimes". The names are the columns of the published heatmap. The waypoints are its steps
 # 0, K//3, 2K//3 and K-1 for K = 10; inverse dynamics is the paper's definition (recover the previous state).
@@ -38,23 +48,34 @@ REGIMES: dict[str, tuple[str, ...]] = {"multi_task": tuple(TASKS)}
 ASKABLE = ("s", "a")  # every other factor is a property: shown at step 0 or not at all, never asked
 
 
-def parse_token(text: str, factors: Sequence[str], context_length: int) -> tuple[str, int]:
-    """The factor and window position of a single token, such as `s[-1]`: ("s", K - 1).
+class Token(NamedTuple):
+    """One token: a factor at a position of the window, or at a step of the episode."""
+
+    factor: str
+    step: int
+    of_episode: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.factor}@{self.step}" if self.of_episode else f"{self.factor}[{self.step}]"
+
+
+def parse_token(text: str, factors: Sequence[str], context_length: int) -> Token:
+    """A single token: `s[-1]`, the window's last state, or `s@150`, that at step 150 of the episode.
 
     Raises:
-        MaskError: it is not one token of this model's window.
+        MaskError: it is not one token of this model.
     """
-    _check_text(text)
-    parser = _Parser(text)
-    terms = parser.terms()
-    if parser.tokens[parser.next][0] != "end":
-        parser.fail("the end of the text")
+    terms = parse_terms(text)
     steps = [step for term in terms for step in term.steps]
     if len(steps) != 1 or not isinstance(steps[0], Index) or steps[0].relative:
-        raise MaskError("A value is given to a single token, such as s[-1] or rtg[0].", text, 0)
+        raise MaskError("A value is given to a single token, such as s[-1], rtg[0] or s@150.", text, 0)
     _check_factors(terms, factors, text)
+    if terms[0].of_episode:
+        if terms[0].factor not in ASKABLE:
+            raise MaskError(f"{terms[0].factor} can be given at step 0 only: write {terms[0].factor}[0].", text, 0)
+        return Token(terms[0].factor, steps[0].value, of_episode=True)
     chosen = _select(terms, factors, context_length, -1, text)
-    return terms[0].factor, int(chosen.any(0).int().argmax())
+    return Token(terms[0].factor, int(chosen.any(0).int().argmax()))
 
 
 def parse(text: str) -> Question:
@@ -63,7 +84,7 @@ def parse(text: str) -> Question:
     Raises:
         MaskError: the text does not parse; shows it with a caret under the fault.
     """
-    _check_text(text)
+    check_text(text)
     name = text.strip()
     if re.fullmatch(r"\w+", name):
         if name == RANDOM_MASK or name in REGIMES:
@@ -78,7 +99,7 @@ def parse(text: str) -> Question:
                 text.index(name),
             )
         text = TASKS[name]
-    return _Parser(text).question()
+    return parse_question(text)
 
 
 @dataclass(frozen=True)

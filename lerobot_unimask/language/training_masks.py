@@ -30,8 +30,7 @@ class TrainingMasks(nn.Module):
             return factor, seven).
         factors: the model's factors.
         context_length: K.
-        causal_share: of the windows, or of the updates, that are causal.
-        causal_draw: `window`, each draws whether it is causal; `update`, all of an update's together.
+        causal_share: share of the windows that are causal.
 
     Raises:
         MaskError: a text that does not fit the model, or with a causal share of 1 has no causal form.
@@ -45,7 +44,6 @@ class TrainingMasks(nn.Module):
         context_length: int,
         *,
         causal_share: float = 0.0,
-        causal_draw: str = "window",
     ):
         super().__init__()
         self.factors = tuple(factors)
@@ -72,7 +70,6 @@ class TrainingMasks(nn.Module):
                 TASKS.get(text, text),
             )
         self.causal_share = causal_share if capable.any() else 0.0
-        self.causal_draw = causal_draw
         nothing = (empty.new_zeros(empty.shape[1:]),) * 2
         shown, asked = zip(*(form or nothing for form in forms), strict=True)
         self._keep("causal_shown", torch.stack(shown))  # (T, F, K) for each of the tasks
@@ -135,7 +132,7 @@ class TrainingMasks(nn.Module):
             asked = torch.where(chosen, hidden & self.askable, asked)
         causal: Tensor | bool = False
         if self.causal_share > 0:
-            causal = self._draw_causal(uniform[:, -1], seed, step)  # (B,)
+            causal = uniform[:, -1] < self.causal_share  # (B,)
             task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
             history = self.causal_shown[task]
             if self.random_task is not None:
@@ -144,13 +141,6 @@ class TrainingMasks(nn.Module):
             asked = torch.where(causal[:, None, None], self.causal_asked[task], asked)
         shown, asked = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (shown, asked))
         return Mask(shown, asked, causal).within(valid)
-
-    def _draw_causal(self, uniform: Tensor, seed: int, step: Tensor | int) -> Tensor:
-        """(B,) bool, which windows are causal."""
-        if self.causal_draw == "update":
-            one = torch.full((1,), -1, dtype=torch.int64, device=uniform.device)  # no frame's index
-            uniform = counter_uniform(seed, step, one, 1)[:, 0].expand_as(uniform)
-        return uniform < self.causal_share
 
     def _question_masks(self, valid: Tensor, task: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """One row per window, uniform among those of its task that ask for something valid: two (B, F, K)."""
@@ -171,6 +161,21 @@ class TrainingMasks(nn.Module):
                 hidden[:, f, 0] = uniform[:, f, 0] < 0.5
                 hidden[:, f, 1:] = True
         return hidden
+
+
+def validation_masks(text: str, factors: tuple[str, ...], valid: Tensor, index: Tensor) -> Mask:
+    """One question for each window, the same for every policy.
+
+    Args:
+        text: what is asked, as `training_masks` takes it.
+        valid: (B, K) bool, False past the episode's end.
+        index: (B,) the windows' first frames.
+
+    Raises:
+        MaskError: a factor of the question is not among `factors`.
+    """
+    draw = TrainingMasks(text, factors, valid.shape[1]).to(valid.device)
+    return draw(valid, index.to(valid.device), seed=0, step=VALIDATION_STEP)
 
 
 def _cumulative(weights: Tensor) -> Tensor:

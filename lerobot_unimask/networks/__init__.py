@@ -1,20 +1,15 @@
 """The networks: (window, shown) -> predictions, one file each, chosen by `--policy.network=...`."""
 
-from typing import TYPE_CHECKING
-
 from torch import nn
 
+from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import Factor
-from lerobot_unimask.networks.decision_gpt import DecisionGPT
 from lerobot_unimask.networks.decision_transformer import DecisionTransformer
 from lerobot_unimask.networks.feedforward import FeedForward
 from lerobot_unimask.networks.transformer import Transformer
 
-if TYPE_CHECKING:
-    from lerobot_unimask.configuration_unimask import UniMASKConfig
 
-
-def make_network(config: "UniMASKConfig", factors: dict[str, Factor]) -> nn.Module:
+def make_network(config: UniMASKConfig, factors: dict[str, Factor]) -> nn.Module:
     """The network that the config names, for these factors.
 
     Raises:
@@ -30,10 +25,14 @@ def make_network(config: "UniMASKConfig", factors: dict[str, Factor]) -> nn.Modu
     }
     match config.network:
         case "transformer":
-            return Transformer(factors, stacked=config.token_layout == "stacked", heads=config.heads, **shared)
+            return Transformer(
+                factors,
+                stacked=config.token_layout == "stacked",
+                residuals=config.state_residuals,
+                heads=config.heads,
+                **shared,
+            )
         case "feedforward":
             return FeedForward(factors, **shared)
-        case "decision_gpt":
-            return DecisionGPT(factors, heads=config.heads, **shared)
         case "decision_transformer":
             return DecisionTransformer(factors, heads=config.heads, **shared)

@@ -55,7 +55,7 @@ class DecisionTransformer(nn.Module):
         if "rtg" not in factors:
             raise ValueError(
                 "network=decision_transformer reads a return at every step, and this dataset has no "
-                "'observation.return_to_go'; decision_gpt needs none."
+                "'observation.return_to_go'; network=transformer with attention=causal needs none."
             )
         self.embeddings = nn.ModuleDict(
             {name: FactorEmbedding(factors[name], width, fine_inputs=fine_inputs) for name in ASKABLE}

@@ -1,10 +1,6 @@
-"""A transformer over the tokens of a window that attends in both directions, as the paper's does (section 2.2, appendix
-D), or causally, with the same weights.
+"""What the networks are made of: embeddings of a factor's tokens, attention, and the heads that predict tokens.
 
-In both directions, a hidden token's output predicts that token. Causally, a token's output predicts the next one, given
-it and those before it, so that one pass answers for every step of a window.
-
-Legend of shapes: B windows, K steps, F factors, N tokens, D the dimensions of a factor, W width, H heads.
+Legend of shapes: B windows, K steps, N tokens, D the numbers of a factor, W width, H heads.
 """
 
 from dataclasses import dataclass, field
@@ -134,7 +130,7 @@ class Heads(nn.ModuleDict):
 
     Args:
         width: of what they read.
-        steps: of the window, that one input of theirs speaks for.
+        steps: number of steps that are predicted from one input.
     """
 
     def __init__(self, factors: dict[str, Factor], width: int, *, steps: int = 1):

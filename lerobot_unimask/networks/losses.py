@@ -4,6 +4,7 @@ Legend of shapes: B windows, K steps, D the dimensions of a factor.
 """
 
 import math
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor, distributed
@@ -11,6 +12,25 @@ from torch.nn import functional
 
 from lerobot_unimask.data.factors import LOG_SCALE, Component, Factor
 from lerobot_unimask.data.window import Window
+
+
+class LossParts(Mapping[str, float]):
+    """What makes up a loss, for the log: scalar tensors, read off the device when somebody asks for the numbers.
+
+    lerobot-train does so once it has waited for the update, so that between forward and backward nothing waits.
+    """
+
+    def __init__(self, parts: Mapping[str, Tensor | float]):
+        self._parts = parts
+
+    def __getitem__(self, name: str) -> float:
+        return float(self._parts[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
 
 
 def component_loss(prediction: Tensor, value: Tensor, component: Component) -> Tensor:

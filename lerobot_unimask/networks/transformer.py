@@ -25,8 +25,8 @@ class Transformer(nn.Module):
         stacked: one token per step, made of all its factors (paper, appendix "Input stacking"), which cannot attend
             causally; otherwise one token for each property, at the front, and one for each state and action, in the
             order of time.
-        fine_inputs: encode continuous values as `NumberEncoding` does, and predict continuous states as departures from
-            their `course`.
+        residuals: whether to predict continuous states as departures from their `course`.
+        fine_inputs: whether to read continuous values as `NumberEncoding` does.
     """
 
     def __init__(
@@ -35,6 +35,7 @@ class Transformer(nn.Module):
         *,
         context_length: int,
         stacked: bool,
+        residuals: bool,
         fine_inputs: bool,
         width: int,
         depth: int,
@@ -56,7 +57,7 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.on_course = {
-            i: c.dims for i, c in enumerate(factors["s"].components) if fine_inputs and not c.discrete
+            i: c.dims for i, c in enumerate(factors["s"].components) if residuals and not c.discrete
         }  # which of the states' components, and their dimensions
         self.heads = Heads(factors, width)
 

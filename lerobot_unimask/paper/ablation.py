@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask.data.episodes import open_dataset
 from lerobot_unimask.measures import latency, measure
 from lerobot_unimask.paper.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
 from lerobot_unimask.paper.table import QUESTIONS, maze_returns, mean_return
@@ -108,7 +109,7 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         "zero_hidden": run["row"] == config.zero_hidden,
         "processor_seconds_per_update": seconds / config.steps,
         "latency": latency(policy),
-        **measure(policy, root, unseen[: config.measured_episodes], ahead=config.ahead),
+        **measure(policy, open_dataset(policy.config, root), unseen[: config.measured_episodes], ahead=config.ahead),
     }
 
 

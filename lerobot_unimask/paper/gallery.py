@@ -24,7 +24,7 @@ from lerobot_unimask.envs.doorkey.rules import GOAL, START_PAIRS, DynamicsCheck
 from lerobot_unimask.envs.maze2d.pictures import maze_trajectories
 from lerobot_unimask.language.masks import tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.paper.questions import CORNER, IMITATION, PROPERTY, PROPERTY_QUESTION, play
+from lerobot_unimask.paper.questions import CORNER, IMITATION, PROPERTY, PROPERTY_QUESTION, rollout
 from lerobot_unimask.plots.answers import distributions, marginals, mask_diagram
 
 DOTS_PER_INCH = 180
@@ -126,7 +126,7 @@ def _property(policy: UniMASKPolicy) -> Picture:
     for name, value in asked.items():
         question = IMITATION if value is None else PROPERTY_QUESTION
         given = {} if value is None else {f"{PROPERTY}[0]": value}
-        groups[name] = play(policy, starts, question, given, seed=0).states
+        groups[name] = rollout(policy, starts, question, given, seed=0).states
         share = (groups[name][..., 0] == CORNER).any(axis=1).mean()
         captions.append(f"{share:.0%} of {len(starts)} rollouts visit it")
     text = f"`{PROPERTY_QUESTION}` with 1 and with 0, beside imitation; sampled actions, twelve rollouts of each."

@@ -29,26 +29,32 @@ from lerobot_unimask.envs.doorkey.optimum import FEATURES, Optimum, entropies, m
 from lerobot_unimask.envs.doorkey.rules import FPS, HORIZON
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
+from lerobot_unimask.paper.early_stopping import train_to_lowest
 from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, run_study, write_results
 from lerobot_unimask.plots.heatmaps import Panel, heatmaps
-from lerobot_unimask.training import Trainer, train_to_lowest
+from lerobot_unimask.training import Trainer
 from lerobot_unimask.validation import answered, task_losses
 
 FINETUNE = "finetune"
 
 PAPER = Path(__file__).parent / "paper"
 
-# Row -> its policy's settings, over those of the config file
-_OWN_ATTENTION = {"attention": None, "token_layout": "separate"}
+# The paper's other architectures, as settings over those of the config file; its Decision-GPT is the causal transformer
+ARCHITECTURES: dict[str, dict[str, Any]] = {
+    "feedforward": {"network": "feedforward", "attention": None, "token_layout": "separate"},
+    "decision_gpt": {"attention": "causal", "token_layout": "separate"},
+    "decision_transformer": {"network": "decision_transformer", "attention": None, "token_layout": "separate"},
+}
 
+# Row -> its policy's settings, over those of the config file
 ROWS: dict[str, dict[str, Any]] = {
     **{task: {"training_masks": task} for task in TASKS},
     "multi_task": {"training_masks": "multi_task"},
     RANDOM_MASK: {"training_masks": RANDOM_MASK},
     "acts_and_asks": {"training_masks": RANDOM_MASK, "attention": "both", "token_layout": "separate"},
     **{
-        f"{network}_{task}": {"training_masks": task, "network": network, **_OWN_ATTENTION}
-        for network, tasks in {
+        f"{name}_{task}": {"training_masks": task, **ARCHITECTURES[name]}
+        for name, tasks in {
             "feedforward": ("behavior_cloning", RANDOM_MASK),
             "decision_gpt": ("behavior_cloning", "reward_conditioned"),
             "decision_transformer": ("behavior_cloning", "reward_conditioned"),
@@ -172,7 +178,7 @@ def optimum_losses(config: HeatmapConfig) -> dict[str, float]:
     losses = {}
     for task in TASKS:
         mask = TrainingMasks(task, tuple(FEATURES), K)(window.valid, batch["index"], seed=0, step=VALIDATION_STEP)
-        losses[task] = mean_over_asked(entropies(optimum(window, mask)), mask.asked)
+        losses[task] = mean_over_asked(entropies(optimum.predict(window, mask)), mask.asked)
     return losses
 
 

@@ -1,13 +1,12 @@
 """Return against updates: every checkpoint of a run, rolled out with LeRobot's own evaluation."""
 
-import platform
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from lerobot_unimask.data.checkpoints import checkpoints_of, training_settings
-from lerobot_unimask.evaluating import rollouts
+from lerobot_unimask.evaluating import rollout
+from lerobot_unimask.records import versions
 
 
 def learning_curve(
@@ -25,7 +24,7 @@ def learning_curve(
         points = []
         for path in checkpoints:
             count = last_episodes if path == checkpoints[-1] else episodes
-            points.append(rollouts(path, env_type, count, batch_size=min(batch_size, count), seed=seed))
+            points.append(rollout(path, env_type, count, batch_size=min(batch_size, count), seed=seed))
             result = "{updates} updates: return {mean_return:.3f} +- {standard_error:.3f} over {episodes}".format(
                 **points[-1]
             )
@@ -43,10 +42,7 @@ def learning_curve(
         "environment": env_type,
         "seed": seed,
         "runs": records,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in ("torch", "lerobot", "lerobot_policy_unimask")},
-        },
+        "versions": versions(),
     }
 
 

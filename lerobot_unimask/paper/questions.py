@@ -6,11 +6,9 @@ does from a start is exact, by dynamic programming over the same tables.
 Legend of shapes: P starts, N rollouts, K = 10 steps, S = 512 states (agent cell, key cell, door open or not).
 """
 
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -26,6 +24,7 @@ from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, HORIZON, START_PA
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS, Mask
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.records import versions
 
 IMITATION, GOAL, RETURN = (TASKS[name] for name in ("behavior_cloning", "goal_conditioned", "reward_conditioned"))
 
@@ -90,14 +89,14 @@ def expert_outcomes(starts: np.ndarray = START_PAIRS, expert: Expert = "paper") 
 
 
 @dataclass(frozen=True)
-class Played:
+class Rollouts:
     """N episodes: the states (N, K, 2) in the window, and the returns (N,) of all its actions."""
 
     states: np.ndarray
     returns: np.ndarray
 
 
-def play(policy: UniMASKPolicy, starts: np.ndarray, question: str, given: Given, *, seed: int) -> Played:
+def rollout(policy: UniMASKPolicy, starts: np.ndarray, question: str, given: Given, *, seed: int) -> Rollouts:
     """Whole episodes from starts (N, 2), all at once, with sampled actions, by the rules' tables."""
     generator = torch.Generator(policy.device).manual_seed(seed)
     agent, key = starts.T
@@ -112,10 +111,10 @@ def play(policy: UniMASKPolicy, starts: np.ndarray, question: str, given: Given,
         agent, key, door = step(agent, key, door, action[:, 0].cpu().numpy())
         total = total + reward(before, agent)
     policy.reset()
-    return Played(np.stack(states, axis=1), total)
+    return Rollouts(np.stack(states, axis=1), total)
 
 
-def goals(policy: UniMASKPolicy, outcomes: Outcomes, imitation: Played, *, each: int, seed: int) -> dict[str, Any]:
+def goals(policy: UniMASKPolicy, outcomes: Outcomes, imitation: Rollouts, *, each: int, seed: int) -> dict[str, Any]:
     """Final states that the expert reaches seldom, asked for from the start from which it does.
 
     Args:
@@ -124,8 +123,10 @@ def goals(policy: UniMASKPolicy, outcomes: Outcomes, imitation: Played, *, each:
     """
     start, agent, key = np.nonzero((outcomes.final >= RARE) & (outcomes.final <= COMMON))
     wanted = np.stack([agent, key], axis=-1).repeat(each, axis=0)
-    played = play(policy, START_PAIRS[start].repeat(each, axis=0), GOAL, {"s[-1]": torch.from_numpy(wanted)}, seed=seed)
-    reached = (played.states[:, -1] == wanted).all(axis=-1)
+    rolled = rollout(
+        policy, START_PAIRS[start].repeat(each, axis=0), GOAL, {"s[-1]": torch.from_numpy(wanted)}, seed=seed
+    )
+    reached = (rolled.states[:, -1] == wanted).all(axis=-1)
     final = imitation.states[:, -1].reshape(len(START_PAIRS), -1, 2)  # (P, episodes, 2)
     by_chance = (final[start] == np.stack([agent, key], axis=-1)[:, None]).all(axis=-1).mean(axis=1)
     return {
@@ -144,8 +145,8 @@ def returns(policy: UniMASKPolicy, outcomes: Outcomes, *, each: int, seed: int) 
     rows = []
     for number, asked in enumerate(RETURNS):
         starts = START_PAIRS[outcomes.returns[:, HORIZON + asked] >= RARE].repeat(each, axis=0)
-        played = play(policy, starts, RETURN, {"rtg[0]": float(asked)}, seed=seed + number)
-        mean = played.returns.mean()
+        rolled = rollout(policy, starts, RETURN, {"rtg[0]": float(asked)}, seed=seed + number)
+        mean = rolled.returns.mean()
         rows.append(
             {
                 "asked": asked,
@@ -153,21 +154,21 @@ def returns(policy: UniMASKPolicy, outcomes: Outcomes, *, each: int, seed: int) 
                 "rollouts": len(starts),
                 "mean_return": mean,
                 "deviation": abs(mean - asked),
-                "standard_error": played.returns.std() / np.sqrt(len(starts)),
-                "exactly": (played.returns == asked).mean(),
+                "standard_error": rolled.returns.std() / np.sqrt(len(starts)),
+                "exactly": (rolled.returns == asked).mean(),
             }
         )
     return {"question": RETURN, "returns": rows, "largest_deviation": max(row["deviation"] for row in rows)}
 
 
-def visits(policy: UniMASKPolicy, outcomes: Outcomes, imitation: Played, *, each: int, seed: int) -> dict[str, Any]:
+def visits(policy: UniMASKPolicy, outcomes: Outcomes, imitation: Rollouts, *, each: int, seed: int) -> dict[str, Any]:
     """The corner, asked to visit it and not to, over starts with neither agent nor key in it: shares that did."""
     chosen = (START_PAIRS != CORNER).all(axis=1)  # (P,)
     starts = START_PAIRS[chosen].repeat(each, axis=0)
     result = {"question": PROPERTY_QUESTION, "starts": int(chosen.sum()), "rollouts": len(starts)}
     for number, (name, value) in enumerate({"asked_to": 1, "asked_not_to": 0}.items()):
-        played = play(policy, starts, PROPERTY_QUESTION, {f"{PROPERTY}[0]": value}, seed=seed + number)
-        result[name] = (played.states[..., 0] == CORNER).any(axis=1).mean()
+        rolled = rollout(policy, starts, PROPERTY_QUESTION, {f"{PROPERTY}[0]": value}, seed=seed + number)
+        result[name] = (rolled.states[..., 0] == CORNER).any(axis=1).mean()
     cells = imitation.states[..., 0].reshape(len(START_PAIRS), -1, HORIZON)[chosen]
     result["imitation"] = (cells == CORNER).any(axis=-1).mean()
     result["expert"] = outcomes.visits[chosen].mean()
@@ -299,7 +300,7 @@ def ask_everything(
         )
     began = time.monotonic()
     outcomes = expert_outcomes(expert=expert)
-    imitation = play(policy, START_PAIRS.repeat(10 * each, axis=0), IMITATION, {}, seed=seed)
+    imitation = rollout(policy, START_PAIRS.repeat(10 * each, axis=0), IMITATION, {}, seed=seed)
     record: dict[str, Any] = {
         "what": "sampled rollouts under questions, joint samples and random masks, of one DoorKey policy",
         "updates": int(policy.updates),
@@ -320,10 +321,7 @@ def ask_everything(
     if PROPERTY in policy.factors:
         record["visits"] = visits(policy, outcomes, imitation, each=10 * each, seed=seed + 300)
     record["seconds"] = round(time.monotonic() - began, 1)
-    record["versions"] = {
-        "python": platform.python_version(),
-        **{name: version(name) for name in ("torch", "lerobot", "lerobot_policy_unimask")},
-    }
+    record["versions"] = versions()
     return _plain(record)
 
 

@@ -19,9 +19,11 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask.data.episodes import open_dataset
 from lerobot_unimask.measures import unseen_windows
+from lerobot_unimask.paper.early_stopping import train_to_lowest
 from lerobot_unimask.paper.study import Run, VariantsConfig, run_study, write_results
-from lerobot_unimask.training import Trainer, check_settings, train_to_lowest
+from lerobot_unimask.training import Trainer, check_settings
 
 BATCH_SIZE = "batch_size"  # the one setting that is not the policy's
 
@@ -129,7 +131,11 @@ def execute(config: SearchConfig, run: Run) -> dict[str, Any]:
     root = _root(config, config.episodes, 0)
     trainer = Trainer(settings, root, seed=run["seed"], steps=config.steps, batch_size=batch_size)
     unseen = _root(config, config.validation_episodes, 1)
-    batch = unseen_windows(trainer.policy, unseen, range(config.validation_episodes))
+    batch = unseen_windows(
+        open_dataset(trainer.policy.config, unseen),
+        trainer.policy.config.context_length,
+        range(config.validation_episodes),
+    )
     return {**train_to_lowest(trainer, batch, every=config.evaluate_every), **trainer.record()}
 
 

@@ -11,7 +11,6 @@ import json
 import logging
 import math
 import multiprocessing
-import os
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -29,7 +28,7 @@ from optuna.distributions import BaseDistribution
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
 
-from lerobot_unimask.records import versions
+from lerobot_unimask.records import versions, write_json
 
 Run = dict[str, Any]  # what makes a run: JSON values
 
@@ -219,14 +218,7 @@ def _keep_settings(output: Path, settings: Mapping[str, Any]) -> None:
                 f"{output} holds runs with {name}={json.dumps(kept[name])}, and now it is {json.dumps(value)}: choose "
                 "another name and output."
             )
-    _write(path, {**kept, **settings})
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    """At once: a file is there in full or not at all."""
-    partial = path.with_suffix(f".{os.getpid()}")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    partial.replace(path)
+    write_json(path, {**kept, **settings}, say=False)
 
 
 def work(name: str, storage: str, execute: Execute, output: Path, heartbeat: int) -> None:
@@ -265,9 +257,9 @@ def _objective(trial: optuna.Trial, study: optuna.Study, execute: Execute, outpu
     else:
         began = time.monotonic()
         record = execute(run)
-        record = {**run, **record, "wall_seconds": round(time.monotonic() - began, 1), "versions": versions()}
+        record = {**run, **record, "wall_seconds": round(time.monotonic() - began, 1), "versions": versions("optuna")}
     if not path.exists():
-        _write(path, record)
+        write_json(path, record, say=False)
     trial.set_user_attr("record", record)
     print(_progress(study, trial, record), flush=True)
     return math.inf if math.isnan(record["loss"]) else record["loss"]  # Optuna would count it as a failure
@@ -313,7 +305,7 @@ def key_of(trial: FrozenTrial) -> str | None:
 
 def write_results(output: Path, name: str, record: Mapping[str, Any], text: str) -> None:
     """A study's record as NAME.json, its table as NAME.md."""
-    _write(output / f"{name}.json", record)
+    write_json(output / f"{name}.json", record, say=False)
     (output / f"{name}.md").write_text(text)
 
 

@@ -20,7 +20,7 @@ from typing import Any
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask.data.factors import RETURN_TO_GO, STATE
 from lerobot_unimask.data.returns import read_starts
-from lerobot_unimask.evaluating import rollouts
+from lerobot_unimask.evaluating import rollout
 from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, mean_over_seeds, run_study, write_results
 from lerobot_unimask.training import Trainer
 
@@ -38,7 +38,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "acts_and_asks": {"training_masks": "random_mask", "attention": "both"},
     "feedforward": {"network": "feedforward", "attention": None},
     "decision_transformer": {"network": "decision_transformer", "attention": None},
-    "decision_gpt": {"network": "decision_gpt", "attention": None},
+    "decision_gpt": {"attention": "causal"},
 }
 
 FINETUNED = {  # row -> the one whose weights it goes on from
@@ -148,7 +148,7 @@ def maze_returns(checkpoint: Path, question: str, episodes: int) -> dict[str, An
     """`rollouts` of one of `QUESTIONS`, from the same starts for every model."""
     asked = {"inference_mask": question, "target_return": "auto" if question == "reward_conditioned" else None}
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):  # LeRobot's progress bars
-        return rollouts(checkpoint, "maze2d", episodes, batch_size=min(100, episodes), seed=100_000, **asked)
+        return rollout(checkpoint, "maze2d", episodes, batch_size=min(100, episodes), seed=100_000, **asked)
 
 
 def summary(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:

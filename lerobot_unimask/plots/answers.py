@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from lerobot_unimask.asking.answers import Answer, Distribution
+from lerobot_unimask.asking.answers import Answer, ContinuousDistribution, DiscreteDistribution
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE, Mask
@@ -87,7 +87,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
             recorded = truth.values[name][window, :, distribution.component.dims].numpy(force=True)  # (K, d)
             recorded = np.where(truth.valid[window].numpy(force=True)[:, None], recorded, np.nan)
         shown = answer.mask.shown[name][window].numpy(force=True)  # (K,)
-        if distribution.probabilities is not None:
+        if isinstance(distribution, DiscreteDistribution):
             _draw_heat_map(axes, distribution, recorded, shown, probability, window)
         else:
             _draw_bands(axes, distribution, recorded, shown, window)
@@ -95,7 +95,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
         axes.tick_params(labelsize=SMALL)
     K = answer.mask.shown["s"].shape[1]
     grid[-1].set(xlim=(-0.5, K - 0.5), xlabel="step", xticks=range(0, K, max(1, K // 20)))
-    if any(d.probabilities is not None for _, d in rows):
+    if any(isinstance(d, DiscreteDistribution) for _, d in rows):
         colorbar = figure.colorbar(probability, ax=list(grid), shrink=0.8, aspect=25, pad=0.01)
         colorbar.set_label("probability", fontsize=SMALL + 1)
         colorbar.ax.tick_params(labelsize=SMALL, length=2)
@@ -107,7 +107,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
 
 def _draw_heat_map(
     axes: Axes,
-    distribution: Distribution,
+    distribution: DiscreteDistribution,
     recorded: np.ndarray | None,
     shown: np.ndarray,
     colours: ScalarMappable,
@@ -127,13 +127,13 @@ def _draw_heat_map(
 
 
 def _draw_bands(
-    axes: Axes, distribution: Distribution, recorded: np.ndarray | None, shown: np.ndarray, window: int
+    axes: Axes, distribution: ContinuousDistribution, recorded: np.ndarray | None, shown: np.ndarray, window: int
 ) -> None:
     """A line for each dimension, with a band of one scale to each side, in the dataset's units."""
     mean = distribution.mean[window].numpy(force=True)  # (K, d)
     steps = np.arange(len(mean))
     for i, colour in zip(range(mean.shape[1]), COLOURS * mean.shape[1], strict=False):
-        axes.plot(steps, mean[:, i], marker=".", color=colour, linewidth=1.2, label=str(i))
+        axes.plot(steps, mean[:, i], marker=".", color=colour, linewidth=1.2, label=distribution.component.names[i])
         if distribution.scale is not None:
             scale = distribution.scale[window, :, i].numpy(force=True)
             axes.fill_between(steps, mean[:, i] - scale, mean[:, i] + scale, color=colour, alpha=0.2, linewidth=0)
@@ -142,7 +142,7 @@ def _draw_bands(
             axes.scatter(steps[~shown], recorded[~shown, i], marker="x", s=18, color=VERMILLION, zorder=3)
     axes.grid(color=FAINT)
     if mean.shape[1] > 1:
-        axes.legend(title="dimension", fontsize=SMALL, title_fontsize=SMALL, ncols=2, loc="best")
+        axes.legend(fontsize=SMALL, ncols=2, loc="best")
 
 
 def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -> Figure:
@@ -163,8 +163,8 @@ def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -
                 values = {group: window.values[name][..., i][window.valid] for group, window in groups.items()}
                 values = {group: v[~v.isnan()].numpy(force=True) for group, v in values.items()}
                 if all(map(len, values.values())):
-                    number = "" if component.discrete else f"[{i - component.dims.start}]"
-                    parts.append((f"{name}: {component.name}{number}", component, values))
+                    label = component.names[i - component.dims.start]
+                    parts.append((f"{name}: {label}", component, values))
     if not parts:
         raise ValueError("There is no state or action that all of the windows have: nothing to draw.")
     columns = min(3, len(parts))

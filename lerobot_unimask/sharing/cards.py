@@ -4,30 +4,27 @@ Written from what the policy or the dataset's folder itself holds, without askin
 """
 
 import io
-import json
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from textwrap import dedent, indent
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow.parquet as pq
 import torch
 from huggingface_hub import DatasetCardData, ModelCardData
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 from matplotlib.figure import Figure
 
-from lerobot_unimask.envs.doorkey import rules
-from lerobot_unimask.envs.doorkey.pictures import trajectories
-from lerobot_unimask.envs.maze2d import maze
-from lerobot_unimask.envs.maze2d.pictures import draw_maze
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.data.episodes import provenance_of
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS, Mask, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
-from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.plots.answers import mask_diagram
-from lerobot_unimask.plots.style import WIDTH
+from lerobot_unimask.records import read_json
 
 PLUGIN = "lerobot_policy_unimask"
 
@@ -38,26 +35,37 @@ LICENSE = "apache-2.0"
 DRAWN_EPISODES = 6
 
 
-def policy_card(
-    policy: UniMASKPolicy,
-    repo_id: str,
-    *,
-    train_config: Mapping[str, Any] | None = None,
-    command: str | None = None,
-    results: Sequence[Mapping[str, Any]] = (),
-) -> dict[str, bytes]:
+@dataclass(frozen=True)
+class PolicyFacts:
+    """What a policy's card is written from.
+
+    Attributes:
+        weights: training masks, text -> weight.
+        parameters: number of the network's.
+        updates: number of those made.
+        train_config: what lerobot-train saved beside the weights.
+        command: training command.
+    """
+
+    config: UniMASKConfig
+    weights: Mapping[str, float]
+    parameters: int
+    updates: int
+    train_config: Mapping[str, Any] | None = None
+    command: str | None = None
+
+
+def policy_card(facts: PolicyFacts, repo_id: str, results: Sequence[Mapping[str, Any]] = ()) -> dict[str, bytes]:
     """A policy's card: file name -> content.
 
     Args:
-        repo_id: where it is to be found, for the commands that the card shows.
-        train_config: what lerobot-train saved beside the weights.
-        command: the training command.
+        repo_id: name under which it is to be found, for the commands that the card shows.
         results: records of `unimask validate` (losses by task) and lerobot-eval's `eval_info.json`s (rollouts).
 
     Raises:
         ValueError: a record of another kind.
     """
-    config = policy.config
+    config, train_config = facts.config, facts.train_config
     data = (train_config or {}).get("dataset") or {}
     public = bool(config.dataset_revision or not data.get("root")) and data.get("repo_id")
     metadata = ModelCardData(
@@ -67,7 +75,7 @@ def policy_card(
         tags=sorted({"lerobot", "robotics", "unimask", *(config.tags or [])}),
         datasets=[data["repo_id"]] if public else None,
     )
-    questions, picture = _questions(policy)
+    questions, picture = _questions(facts)
     parts = [
         f"# {repo_id.split('/')[-1]}",
         "A [UniMASK](https://arxiv.org/abs/2211.10869) policy: one masked model that answers any question about "
@@ -75,14 +83,14 @@ def policy_card(
         f"`{PLUGIN}` (version {version(PLUGIN)} has pushed it):",
         _code(INSTALL),
         "## Try it",
-        _code(_commands(policy, repo_id, train_config or {})),
+        _code(_commands(facts, repo_id)),
         "## The questions it was trained on",
         questions,
         "![The question that it answers when it acts](mask.png)",
         "## The model",
-        _model(policy),
+        _model(facts),
         "## Training",
-        _training(policy, repo_id, train_config, command),
+        _training(facts, repo_id),
     ]
     if results:
         parts += ["## Results", *_results(results)]
@@ -90,10 +98,10 @@ def policy_card(
     return {"README.md": text.encode(), "mask.png": picture}
 
 
-def _questions(policy: UniMASKPolicy) -> tuple[str, bytes]:
+def _questions(facts: PolicyFacts) -> tuple[str, bytes]:
     """Each training mask with its share of the windows and, drawn, one of its masks; the acting question's picture."""
-    factors, K = tuple(policy.factors), policy.config.context_length
-    weights = policy.training_masks.weights
+    factors, K = tuple(facts.config.features), facts.config.context_length
+    weights = facts.weights
     lines = []
     for text, weight in weights.items():
         if text == RANDOM_MASK:
@@ -103,7 +111,7 @@ def _questions(policy: UniMASKPolicy) -> tuple[str, bytes]:
             meaning = TASKS.get(text, text) + (f"   at t = {t}" if t is not None else "")
         name = text if text in TASKS or text == RANDOM_MASK else "question"
         lines += [f"{name} ({weight / sum(weights.values()):.0%}): {meaning}", indent(mask.draw(), "    ")]
-    acting, _ = _example(policy.config.inference_mask, factors, K)
+    acting, _ = _example(facts.config.inference_mask, factors, K)
     legend = "Shown `#`, asked `?`, neither `.`, over the steps of a window:"
     return f"{legend}\n\n{_code(chr(10).join(lines), 'text')}", _png(mask_diagram(acting))
 
@@ -128,46 +136,45 @@ def _random_example(factors: tuple[str, ...], K: int) -> Mask:
     )
 
 
-def _model(policy: UniMASKPolicy) -> str:
+def _model(facts: PolicyFacts) -> str:
     rows = []
-    for name, features in policy.config.features.items():
+    for name, features in facts.config.features.items():
         for feature in features:
             names = ", ".join(feature.names or ["…"] * feature.size)
             values = "continuous"
             if feature.categories:
                 values = " x ".join(map(str, feature.categories)) + " categories"
             rows.append(f"| `{name}` | `{feature.key}` | {feature.size} | {names} | {values} |")
-    parameters = sum(parameter.numel() for parameter in policy.network.parameters())
-    config = policy.config
+    config = facts.config
     return (
         "| factor | column | numbers | names | values |\n| --- | --- | --- | --- | --- |\n"
         + "\n".join(rows)
         + f"\n\nContext length: {config.context_length} steps. Attention: {config.attention}. Acting asks "
-        f"`{TASKS.get(config.inference_mask, config.inference_mask)}`. {parameters:,} parameters, "
-        f"{int(policy.updates):,} updates."
+        f"`{TASKS.get(config.inference_mask, config.inference_mask)}`. {facts.parameters:,} parameters, "
+        f"{facts.updates:,} updates."
     )
 
 
-def _training(policy: UniMASKPolicy, repo_id: str, train_config: Mapping[str, Any] | None, command: str | None) -> str:
-    if train_config is None:
+def _training(facts: PolicyFacts, repo_id: str) -> str:
+    if facts.train_config is None:
         return "How it was trained was not saved with it."
-    data = train_config["dataset"]
-    revision = policy.config.dataset_revision
+    data = facts.train_config["dataset"]
+    revision = facts.config.dataset_revision
     place = f"at revision `{revision}`" if revision else "local: it was read from a folder, which has no revision"
     again = f"lerobot-train --config_path={repo_id} --policy.push_to_hub=false --output_dir=outputs/again"
-    return f"Data: `{data['repo_id']}`, {place}.\n\n{_code(command or again)}"
+    return f"Data: `{data['repo_id']}`, {place}.\n\n{_code(facts.command or again)}"
 
 
-def _commands(policy: UniMASKPolicy, repo_id: str, train_config: Mapping[str, Any]) -> str:
+def _commands(facts: PolicyFacts, repo_id: str) -> str:
     """Evaluating, asking, fine-tuning: three commands that work as they stand where the training did."""
+    train_config, config = facts.train_config or {}, facts.config
     data = train_config.get("dataset") or {"repo_id": "ME/DATASET"}
     dataset = f"--dataset.repo_id={data['repo_id']}"
-    if data.get("root") and not policy.config.dataset_revision:
+    if data.get("root") and not config.dataset_revision:
         dataset += f" --dataset.root={shlex.quote(str(data['root']))}"
-    environment = (train_config.get("env") or {}).get("type") or _environment(data.get("root")) or "YOUR_ENVIRONMENT"
-    weights = policy.training_masks.weights
-    question = next((text for text in weights if text != RANDOM_MASK), "behavior_cloning")
-    _, t = _example(question, tuple(policy.factors), policy.config.context_length)
+    environment = (train_config.get("env") or {}).get("type") or _robot(data.get("root")) or "YOUR_ENVIRONMENT"
+    question = next((text for text in facts.weights if text != RANDOM_MASK), "behavior_cloning")
+    _, t = _example(question, tuple(config.features), config.context_length)
     at = "" if t is None else f" --t={t}"
     return (
         f"lerobot-eval --policy.path={repo_id} --env.type={environment} --eval.n_episodes=100 --eval.batch_size=50\n"
@@ -178,11 +185,10 @@ def _commands(policy: UniMASKPolicy, repo_id: str, train_config: Mapping[str, An
     )
 
 
-def _environment(root: str | None) -> str | None:
-    """The `--env.type` of a dataset built here, if its folder is still there."""
+def _robot(root: str | None) -> str | None:
+    """The robot of a training dataset, which for one built here is its `--env.type`, if its folder is still there."""
     info = Path(root or "") / "meta" / "info.json"
-    robot = json.loads(info.read_text()).get("robot_type") if root and info.exists() else None
-    return robot if robot in ("doorkey", "maze2d") else None
+    return read_json(info).get("robot_type") if root and info.exists() else None
 
 
 def _results(results: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -206,39 +212,20 @@ def _results(results: Sequence[Mapping[str, Any]]) -> list[str]:
     return parts
 
 
-class Environment(NamedTuple):
-    """What a dataset's card says about where its episodes took place."""
+class Described(Protocol):
+    """What a dataset's card asks of its environment; `envs.record.Environment` is one."""
 
-    type: str  # --env.type
+    type: str
+    horizon: int
     description: str
     expert: str
     reward: str
-    columns: dict[str, str]
+    columns: Mapping[str, str]
 
+    def draw_episodes(self, states: np.ndarray, provenance: Mapping[str, Any]) -> Figure:
+        """A picture of episodes' states, (N, T, D)."""
+        ...
 
-ENVIRONMENTS = {
-    rules.ENV_ID: Environment(
-        type="doorkey",
-        description="DoorKey, a gridworld of 4 x 4 cells: fetch the key, open the door, walk to the goal. Every "
-        "episode has 10 steps.",
-        expert="noisily rational, its actions drawn with probability proportional to exp(beta C(a))",
-        reward="by how many steps the agent came closer to the goal: 1, 0 or -1",
-        columns={
-            OBS_STATE: "the agent's cell and the key's, 0 to 15, numbered row by row; equal once the key is carried",
-            ACTION: "right 0, down 1, left 2, up 3",
-        },
-    ),
-    maze.ENV_ID: Environment(
-        type="maze2d",
-        description="Maze2D, a point mass in a maze on MuJoCo, its velocity hidden. Every episode has 200 steps.",
-        expert="a waypoint controller with normal noise on its actions",
-        reward="by how much the distance to the goal shrank, in cells",
-        columns={
-            OBS_STATE: "the position and the goal's, x and y each, in cells",
-            ACTION: "the force along x and y, each in [-1, 1]",
-        },
-    ),
-}
 
 COLUMNS = {
     "observation.return_to_go": "the sum of rewards from this step to the episode's end",
@@ -252,12 +239,10 @@ COLUMNS = {
 }
 
 
-def dataset_card(root: Path, repo_id: str) -> dict[str, bytes]:
+def dataset_card(root: Path, repo_id: str, environment: Described | None = None) -> dict[str, bytes]:
     """A dataset's card: file name -> content; with a picture where it is of an environment of this package."""
-    info = json.loads((root / "meta" / "info.json").read_text())
-    path = root / "meta" / "provenance.json"
-    provenance = json.loads(path.read_text()) if path.exists() else {}
-    environment = ENVIRONMENTS.get(provenance.get("environment"))
+    info = read_json(root / "meta" / "info.json")
+    provenance = provenance_of(root)
     metadata = DatasetCardData(
         license=LICENSE,
         task_categories=["robotics"],
@@ -312,24 +297,14 @@ def _categories(column: Mapping[str, Any]) -> str:
 
 
 def _draw_episodes(
-    root: Path, info: Mapping[str, Any], provenance: Mapping[str, Any], environment: Environment
+    root: Path, info: Mapping[str, Any], provenance: Mapping[str, Any], environment: Described
 ) -> Figure:
-    """The ways of the first episodes, all of one length, seen from above."""
-    length = {"doorkey": rules.HORIZON, "maze2d": maze.HORIZON}[environment.type]
+    """The first episodes, all of one length."""
+    length = environment.horizon
     path = root / info["data_path"].format(chunk_index=0, file_index=0)
     states = next(pq.ParquetFile(path).iter_batches(DRAWN_EPISODES * length, columns=[OBS_STATE]))[OBS_STATE]
     states = np.array(states.to_pylist()).reshape(-1, length, len(states[0]))  # (N, T, D)
-    if environment.type == "doorkey":
-        return trajectories({f"{len(states)} episodes": states}, most=DRAWN_EPISODES)
-    figure = Figure(figsize=(0.6 * WIDTH, 0.6 * WIDTH), layout="constrained")
-    axes = figure.subplots()
-    draw_maze(axes, provenance["maze"])
-    for way in states:
-        (line,) = axes.plot(way[:, 0], way[:, 1], linewidth=1.2)
-        axes.plot(*way[0, :2], marker=".", color=line.get_color())
-        axes.plot(*way[0, 2:], marker="*", markersize=9, color=line.get_color())
-    axes.set_title("from the dot towards the star")
-    return figure
+    return environment.draw_episodes(states, provenance)
 
 
 def _code(text: str, language: str = "bash") -> str:

@@ -3,15 +3,14 @@
 The client is huggingface_hub, so `HF_ENDPOINT`, `HF_TOKEN`, `HF_HUB_OFFLINE` and its cache work as everywhere else.
 """
 
-import functools
 import hashlib
 import json
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import httpx
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token, snapshot_download
@@ -26,15 +25,10 @@ from huggingface_hub.errors import (
     RevisionNotFoundError,
 )
 from huggingface_hub.file_download import repo_folder_name
-from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import dataset_metadata, lerobot_dataset
 from lerobot.datasets.utils import get_safe_version
 from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
-from lerobot_unimask.data.episodes import check_folder
-
-if TYPE_CHECKING:
-    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.records import read_json
 
 
 class HubError(OSError):
@@ -59,7 +53,7 @@ def fetch(repo_id: str, *, revision: str | None = None, **download: Any) -> Path
         HubError: anything is missing, cannot be reached, or does not have the content that its hash names; of what
             failed nothing stays in the cache. Also where loading it would run code that the repository names.
     """
-    with _pull_errors(repo_id, revision):
+    with pull_errors(repo_id, revision):
         # The processors too: LeRobot's commands read them later, and may be offline then.
         patterns = {"allow_patterns": ["*.json", "*.safetensors"], "ignore_patterns": ["*/*"]}
         folder = Path(snapshot_download(repo_id, revision=revision, **patterns, **download))
@@ -103,7 +97,7 @@ def _check_processors(folder: Path, repo_id: str) -> None:
 
 
 @contextmanager
-def _pull_errors(repo_id: str, revision: str | None) -> Iterator[None]:
+def pull_errors(repo_id: str, revision: str | None) -> Iterator[None]:
     try:
         yield
     except HFValidationError as error:
@@ -136,29 +130,7 @@ def _pull_errors(repo_id: str, revision: str | None) -> Iterator[None]:
         ) from error
 
 
-def install() -> None:
-    """Let LeRobot's own commands keep to what was pulled before, with HF_HUB_OFFLINE=1, and name what was not.
-
-    LeRobot asks the Hub for a dataset's versions even if it has the dataset, and reads a policy's config, whatever its
-    type, before it calls the policy. Does nothing the second time.
-    """
-    if dataset_metadata.get_safe_version is _pulled_version:
-        return
-    dataset_metadata.get_safe_version = lerobot_dataset.get_safe_version = _pulled_version
-    read = PreTrainedConfig.from_pretrained.__func__
-
-    @functools.wraps(read)
-    def read_or_name(cls: type, pretrained_name_or_path: str | Path, **kwargs: Any) -> PreTrainedConfig:
-        try:
-            return read(cls, pretrained_name_or_path, **kwargs)
-        except LocalEntryNotFoundError:
-            with _pull_errors(str(pretrained_name_or_path), kwargs.get("revision")):
-                raise
-
-    PreTrainedConfig.from_pretrained = classmethod(read_or_name)
-
-
-def _pulled_version(repo_id: str, version: Any, **kwargs: Any) -> str:
+def pulled_version(repo_id: str, version: Any, **kwargs: Any) -> str:
     """In place of LeRobot's `get_safe_version`: offline, the version that is asked for, if it has been pulled."""
     if not constants.is_offline_mode():
         return get_safe_version(repo_id, version, **kwargs)
@@ -172,24 +144,20 @@ def _pulled_version(repo_id: str, version: Any, **kwargs: Any) -> str:
 
 
 def push_policy(
-    policy: "UniMASKPolicy",
     folder: Path,
     repo_id: str,
+    card: Mapping[str, bytes],
     *,
     private: bool | None = None,
-    command: str | None = None,
-    results: Sequence[Mapping[str, Any]] = (),
     saved: Path | None = None,
 ) -> str:
     """Push a saved policy with its card: config, weights, processors and train config in one commit.
 
     Args:
-        policy: the policy that is saved in `folder`.
-        folder: as `save_pretrained` or lerobot-train writes it.
+        folder: place of the files, as `save_pretrained` or lerobot-train writes them.
+        card: file name -> content, as `cards.policy_card` writes it.
         private: whether to create the repository as a private one.
-        command: the training command; without one the card has the train config's.
-        results: records for the card, see `cards.policy_card`.
-        saved: where the user finds it, if `folder` is a passing one.
+        saved: folder where the user finds it, if `folder` is a passing one.
 
     Returns:
         The repository's address.
@@ -197,16 +165,6 @@ def push_policy(
     Raises:
         HubError: it could not be pushed. Nothing of it is to be seen on the Hub then.
     """
-    from lerobot_unimask.sharing import cards
-
-    train_config = folder / "train_config.json"
-    card = cards.policy_card(
-        policy,
-        repo_id,
-        train_config=json.loads(train_config.read_text()) if train_config.exists() else None,
-        command=command,
-        results=results,
-    )
     files = {path.name: path for pattern in ("*.json", "*.safetensors") for path in sorted(folder.glob(pattern))}
     return _push(
         {**files, **card},
@@ -218,26 +176,29 @@ def push_policy(
     )
 
 
-def push_dataset(root: Path, repo_id: str, *, private: bool | None = None) -> str:
+def push_dataset(root: Path, repo_id: str, card: Mapping[str, bytes], *, private: bool | None = None) -> str:
     """Push a LeRobotDataset with its card in one commit, and tag that with the version that LeRobot asks for.
 
     The repository then holds these files and no others. See `push_policy` for the rest.
-    """
-    from lerobot_unimask.sharing import cards
 
-    check_folder(root)
+    Raises:
+        ValueError: a file is a link that leads out of the folder.
+    """
     paths = {path.relative_to(root): path for path in sorted(root.rglob("*")) if path.is_file()}
     files = {
         path.as_posix(): place for path, place in paths.items() if not any(part.startswith(".") for part in path.parts)
     }
+    astray = [name for name, place in files.items() if not place.resolve().is_relative_to(root.resolve())]
+    if astray:
+        raise ValueError(f"{root / astray[0]} is a link out of the dataset's folder: put the file itself there.")
     return _push(
-        {**files, **cards.dataset_card(root, repo_id)},
+        {**files, **card},
         repo_id,
         kind="dataset",
         private=private,
         message="Upload dataset and card",
         again=f"unimask push --dataset.root={shlex.quote(str(root))} --repo_id={repo_id}",
-        tag=json.loads((root / "meta" / "info.json").read_text())["codebase_version"],
+        tag=read_json(root / "meta" / "info.json")["codebase_version"],
     )
 
 

@@ -15,22 +15,20 @@ Legend of shapes: B windows, K steps, S states, A actions, C distances of the fi
 
 import itertools
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_unimask.asking.answers import Answer, Predict
+from lerobot_unimask.asking.answers import Answer, Model
 from lerobot_unimask.asking.answers import answer as answer_question
-from lerobot_unimask.data.episodes import provenance_of
 from lerobot_unimask.data.factors import ACTION, RETURN_TO_GO, STATE, Feature, make_factors
 from lerobot_unimask.data.window import Statistics, Window
 from lerobot_unimask.envs.doorkey.expert import Expert, expert_probabilities
 from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, HORIZON, START_PAIRS, distance_to_goal, step
 from lerobot_unimask.language.masks import RANDOM_MASK, Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
-from lerobot_unimask.networks.layers import Predictions
+from lerobot_unimask.networks.layers import Cache, Predictions
 
 FEATURES = {
     "s": [Feature(STATE, 2, [len(CELLS), len(CELLS)], ["agent_cell", "key_cell"])],
@@ -48,10 +46,10 @@ _LOG_ZERO = -1000.0  # instead of minus infinity, which times zero is NaN; its e
 
 
 class Optimum:
-    """The exact posterior of every token given the shown ones: (window, mask) -> predictions, as `asking.Predict`.
+    """The exact posterior of every token given the shown ones, as `asking.answers.Model`.
 
     Args:
-        expert: whose data it is, see `envs.doorkey.expert_progress`.
+        expert: name of whose data it is, see `envs.doorkey.expert_progress`.
         beta: the expert's rationality.
         first_step: the episode's step at which the windows start. Known to the optimum, also where no return shows it.
 
@@ -64,6 +62,8 @@ class Optimum:
             raise ValueError(f"first_step is {first_step}; an episode's steps are 0 to {HORIZON - 1}.")
         states, following = _reachable_states()  # (S, 3), (S, A)
         agent, key, door_open = states.T
+        self.factors = FACTORS
+        self.statistics = Statistics(FEATURES, FACTORS, HORIZON)  # not filled, so that nothing is scaled
         self.first_step = first_step
         self.following = torch.from_numpy(following)
         self.policy = torch.from_numpy(
@@ -76,7 +76,7 @@ class Optimum:
         for _ in range(first_step):
             self.start = self._advance(self.start[:, None] * self.policy)
 
-    def __call__(self, window: Window, mask: Mask, cache: None = None) -> Predictions:
+    def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
         """For every step logarithms of probabilities, float64, of the agent's cell, the key's cell and the action.
 
         Args:
@@ -201,8 +201,7 @@ def exact_answer(window: Window, mask: Mask, *, expert: Expert = "paper", first_
     Raises:
         ValueError: what a window shows cannot occur together.
     """
-    units = Statistics(FEATURES, FACTORS, window.valid.shape[1])  # not filled, so that nothing is scaled
-    return answer_question(Optimum(expert, first_step=first_step), units, FACTORS, window, mask)
+    return answer_question(Optimum(expert, first_step=first_step), window, mask)
 
 
 def divergences(exact: Predictions, predictions: Predictions) -> dict[str, list[Tensor]]:
@@ -231,7 +230,7 @@ def mean_over_asked(costs: dict[str, list[Tensor]], asked: dict[str, Tensor]) ->
 
 
 def random_mask_divergence(
-    optimum: Optimum, predict: Predict, window: Window, normalised: Window, index: Tensor, *, draws: int = 10
+    optimum: Optimum, model: Model, window: Window, normalised: Window, index: Tensor, *, draws: int = 10
 ) -> dict[str, dict[str, float]]:
     """How far a model is from the optimum over many random masks: the mean divergence of the asked-for tokens, in nats.
 
@@ -250,7 +249,7 @@ def random_mask_divergence(
     shares: dict[str, list[Tensor]] = {label: [] for _, _, label in kinds}
     for number in range(draws):
         mask = draw(window.valid, index, seed=0, step=VALIDATION_STEP - number)
-        apart = divergences(optimum(window, mask), predict(normalised, mask, None))
+        apart = divergences(optimum.predict(window, mask), model.predict(normalised, mask))
         hidden = torch.cat([mask.asked["s"], mask.asked["a"]], dim=1).double().mean(1)  # (B,)
         for name, i, label in kinds:
             found[label].append(apart[name][i][mask.asked[name]])
@@ -284,14 +283,3 @@ def _reachable_states() -> tuple[np.ndarray, np.ndarray]:
                 states.append(state)
             following.append(number[state])
     return np.array(states), np.array(following).reshape(len(states), len(ACTIONS))
-
-
-def check_expert(root: Path, exact: Expert | None) -> None:
-    """The optimum is that of the data's own expert.
-
-    Raises:
-        ValueError: the data are another's.
-    """
-    expert = provenance_of(root).get("expert", exact)
-    if exact is not None and expert != exact:
-        raise ValueError(f"{root} holds data of the expert {expert!r}: its optimum is not {exact!r}'s.")

@@ -102,7 +102,7 @@ def rollout_panel(
     policy: UniMASKPolicy, name: str, question: str, given: Given, *, start: Sequence[int] = START
 ) -> Panel:
     """Ask `question` at every step of one episode in the real environment, and take the most likely actions."""
-    episodes = roll_out(policy, [start], question, given)
+    episodes = rollout(policy, [start], question, given)
     states = np.stack([episodes.agent, episodes.key], axis=-1)[:, :HORIZON]  # (1, K, 2)
     achieved = {
         "return": episodes.reward.sum(axis=1).astype(float).tolist(),
@@ -156,7 +156,7 @@ def predicted_states(policy: UniMASKPolicy, shown: Mapping[int, Sequence[int]] |
     return policy.infer(None, f"s[:] | {', '.join(tokens)}", given=given)
 
 
-def roll_out(
+def rollout(
     policy: UniMASKPolicy,
     starts: Sequence[Sequence[int]],
     question: str,
@@ -223,7 +223,7 @@ def possible_steps(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
 def given_states(given: Given, context_length: int) -> dict[str, tuple[int, Sequence[int]]]:
     """The states among the given values: token -> (step, [agent cell, key cell])."""
     return {
-        token: (parse_token(token, ("s",), context_length)[1], value)
+        token: (parse_token(token, ("s",), context_length).step, value)
         for token, value in given.items()
         if token.partition("[")[0].strip() == "s"
     }

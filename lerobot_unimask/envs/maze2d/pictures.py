@@ -29,6 +29,19 @@ def draw_maze(axes: Axes, maze: str = "medium") -> None:
     axes.set_facecolor("white")
 
 
+def draw_ways(states: np.ndarray, maze: str = "medium") -> Figure:
+    """Episodes from above, (N, T, 4) states of N episodes, each from a dot towards a star."""
+    figure = Figure(figsize=(0.6 * WIDTH, 0.6 * WIDTH), layout="constrained")
+    axes = figure.subplots()
+    draw_maze(axes, maze)
+    for way in states:
+        (line,) = axes.plot(way[:, 0], way[:, 1], linewidth=1.2)
+        axes.plot(*way[0, :2], marker=".", color=line.get_color())
+        axes.plot(*way[0, 2:], marker="*", markersize=9, color=line.get_color())
+    axes.set_title("from the dot towards the star")
+    return figure
+
+
 def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str = "medium", window: int = 0) -> Figure:
     """Predicted positions with their uncertainty, the whole maze and a close view.
 

@@ -1,0 +1,239 @@
+"""Acting: how an observation becomes an action. It is a question asked at every step:
+
+    observation -> memory -> window, with what is given -> mask -> network -> the answer's a[t] -> memory
+
+Where the present stands in the window is said by `RolloutMemory` alone; how far it may go, by `new_memory`.
+
+Legend of shapes: B environments, K steps, D the numbers of a factor, H actions of a chunk.
+"""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.asking.answers import Model, answer
+from lerobot_unimask.asking.given import (
+    Given,
+    check_known,
+    check_shown,
+    check_values,
+    give,
+    in_window,
+    read_given,
+)
+from lerobot_unimask.asking.memory import NO_RETURN_SO_FAR, RolloutMemory
+from lerobot_unimask.asking.sampling import sample as draw_jointly
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.returns import EpisodeStarts
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.grammar import MaskError
+from lerobot_unimask.language.masks import Mask, MaskTable, Token, tabulate
+
+logger = logging.getLogger(__name__)
+
+
+class ActingModel(Model):
+    """A model with its config and what it keeps of its training episodes."""
+
+    config: UniMASKConfig
+    episode_starts: EpisodeStarts
+    device: torch.device
+
+
+def act(
+    model: ActingModel,
+    memory: RolloutMemory,
+    state: Tensor,
+    return_so_far: Tensor | None,
+    **question: Any,
+) -> Tensor:
+    """One action for each environment.
+
+    Args:
+        state: (B, D) of the present step, as `observed_state` reads it.
+        return_so_far: (B, 1), rewards received before it, where the environment reports them.
+        question: `mask`, `given`, `sample` and `generator`, as `UniMASKPolicy.select_action` takes them.
+
+    Returns:
+        (B, D) in the dataset's units.
+    """
+    memory.observe(state, None if return_so_far is None else return_so_far.to(model.device).reshape(-1))
+    if not memory.planned:
+        actions = plan(model, memory, **question)
+        memory.planned = list(actions[:, : model.config.n_action_steps].unbind(1))
+    action = memory.planned.pop(0)
+    memory.act(action)
+    return as_action(model, action)
+
+
+def plan(
+    model: ActingModel,
+    memory: RolloutMemory,
+    *,
+    mask: str | None = None,
+    given: Given | None = None,
+    sample: bool | None = None,
+    generator: torch.Generator | None = None,
+    prefix: Tensor | None = None,
+) -> Tensor:
+    """The chunk of actions from the present on, (B, H, D), in the dataset's units.
+
+    Args:
+        prefix: (B, d, D) actions that are on their way already: shown, and returned as they are.
+    """
+    config, present = model.config, memory.position
+    table = acting_table(config.inference_mask if mask is None else mask, model.factors, config.context_length)
+    text = table.question.text
+    tokens = read_given(
+        config.given if given is None else given, model.factors, config.context_length, len(memory.valid)
+    )
+    if given is not None:  # the config's may go unused by a question that is asked in passing
+        check_shown(tokens, table.shows, text)
+    horizon = int(model.statistics.horizon)
+    here = in_window(tokens, memory.first_step, config.context_length, horizon)
+    if "rtg" in model.factors and table.shows["rtg"][0]:
+        target = here.get(("rtg", 0), target_return(model, memory))
+        if target is not None:
+            if memory.step == 0 and horizon > memory.last_position + 1 and memory.return_so_far[:, 0].isnan().any():
+                raise ValueError(NO_RETURN_SO_FAR)
+            here["rtg", 0] = memory.remaining(target.to(model.device))
+    window, known = give(memory.window(model.statistics.horizon), here, memory.known())
+    memory.carry_return(window)
+    question = table.at(present, len(memory.valid))
+    for token in tokens:  # a moment of the episode is shown once the window reaches it
+        position = token.step - memory.first_step
+        if token.of_episode and (token.factor, position) in here:
+            question.shown[token.factor][:, position] = True
+            question.asked[token.factor][:, position] = False
+    _ask_chunk(question, window, known, present, config.chunk_size, prefix)
+    check_known(question, known, text)
+    question = question.to(model.device)
+    if (config.sample_actions if sample is None else sample) and config.chunk_size > 1:
+        values = draw_jointly(model, window, question, order="forward", generator=generator).values["a"]
+    else:
+        said = answer(model, window, question, memory.cache)
+        drawn = config.sample_actions if sample is None else sample
+        values = said.draw("a", generator) if drawn else said.most_likely("a")
+    return values[:, present : present + config.chunk_size]
+
+
+def _ask_chunk(
+    question: Mask, window: Window, known: dict[str, Tensor], present: int, chunk_size: int, prefix: Tensor | None
+) -> None:
+    """Ask for a[t] to a[t + H - 1] at the present t, and show those that are on their way."""
+    ahead = slice(present, present + chunk_size)
+    question.asked["a"][:, ahead] = ~question.shown["a"][:, ahead]
+    if prefix is not None and prefix.shape[1]:
+        begun = slice(present, present + prefix.shape[1])
+        window.values["a"] = window.values["a"].clone()
+        window.values["a"][:, begun] = prefix
+        question.shown["a"][:, begun], question.asked["a"][:, begun] = True, False
+        known["a"] = known["a"].clone()
+        known["a"][begun] = True
+
+
+def new_memory(model: ActingModel, batch_size: int) -> RolloutMemory:
+    """An empty memory. The present goes as far as `n_obs_steps` lets acting remember, and leaves room for a chunk."""
+    config = model.config
+    remembered = config.n_obs_steps or config.context_length
+    last_position = min(remembered - 1, config.context_length - config.chunk_size)
+    return RolloutMemory(model.factors, config.context_length, batch_size, model.device, last_position)
+
+
+def acting_table(text: str, factors: Mapping[str, Factor], context_length: int) -> MaskTable:
+    """The table of a question that a rollout can ask at every step.
+
+    Raises:
+        MaskError: it does not ask for a[t].
+    """
+    table = tabulate(text, tuple(factors), context_length)
+    if not table.acts:
+        raise MaskError(
+            "A mask for a rollout asks for a[t] at every step, as 'a[t] | s[:t+1], a[:t]' does.",
+            table.question.text,
+            table.question.asked[0].position,
+        )
+    return table
+
+
+def target_return(model: ActingModel, memory: RolloutMemory) -> Tensor | None:
+    """The return to ask for from the episode's first step on, (B, 1) or (1, 1); None: nobody asks for one."""
+    target = model.config.target_return
+    if target is None:
+        return None
+    if target == "auto":
+        return model.config.target_return_scale * model.episode_starts.nearest_return(memory.first_state)
+    return torch.tensor([[float(target)]], device=model.device)
+
+
+def observed_state(model: ActingModel, batch: Mapping[str, Tensor]) -> Tensor:
+    """(B, D) of the present step's `s`.
+
+    Raises:
+        ValueError: a column is missing, has another shape, or holds a value that is not legal.
+    """
+    parts = []
+    for feature in model.config.features["s"]:
+        value = batch.get(feature.key)
+        if value is not None and not isinstance(value, Tensor):
+            value = torch.as_tensor(value)
+        if value is not None and value.ndim == 1 and feature.size == 1:
+            value = value.unsqueeze(-1)
+        if value is None or value.ndim != 2 or value.shape[-1] != feature.size:
+            found = "nothing" if value is None else f"shape {tuple(value.shape)}"
+            raise ValueError(
+                f"This policy observes {feature.key!r} with {feature.size} numbers, (batch, {feature.size}); "
+                f"the environment gives {found} under that name."
+            )
+        parts.append(value.to(model.device, torch.float32))
+    state = torch.cat(parts, dim=-1)
+    check_values("The observed state", state, model.factors["s"])
+    return state
+
+
+def as_action(model: Model, action: Tensor) -> Tensor:
+    """Category numbers as integers, other actions as they are."""
+    return action.long() if all(component.discrete for component in model.factors["a"].components) else action
+
+
+def check_settings(config: UniMASKConfig, factors: Mapping[str, Factor]) -> None:
+    """Whether the settings of acting fit the model, before anything runs; warns of what will be missing in a rollout.
+
+    Raises:
+        MaskError: the inference mask does not fit the model, or does not ask for a[t].
+        ValueError: a return is asked of a model without one, or something is given that the mask does not show.
+    """
+    if config.target_return is not None and "rtg" not in factors:
+        raise ValueError(
+            f"target_return is {config.target_return}, but this model has no return factor: its dataset has "
+            "no 'observation.return_to_go'."
+        )
+    table = acting_table(config.inference_mask, factors, config.context_length)
+    tokens = list(read_given(config.given, factors, config.context_length))
+    if config.target_return is not None:
+        if Token("rtg", 0) in tokens:
+            raise ValueError("target_return and given both name rtg[0]; give one of them.")
+        tokens.append(Token("rtg", 0))
+    check_shown(tokens, table.shows, config.inference_mask)
+    missing = [
+        f"{name}[{step}]"
+        for name, ahead in table.shows_ahead.items()
+        for step in ahead.nonzero().flatten().tolist()
+        if Token(name, step) not in tokens
+    ]
+    if missing:
+        logger.warning(
+            "The inference mask shows %s before a rollout has observed it: rollouts fail unless it is given, with "
+            "%s or in each call of select_action.",
+            ", ".join(missing),
+            "target_return" if missing == ["rtg[0]"] else "given",
+        )
+    for token in tokens:
+        if not token.of_episode and not table.shows_ahead[token.factor][token.step]:
+            logger.warning(
+                "%s is given, but the inference mask shows it once it has been observed: it changes nothing.", token
+            )

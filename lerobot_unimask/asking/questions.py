@@ -1,0 +1,75 @@
+"""A question about recorded or given values: its window and its mask, with nothing shown that is not known.
+
+Legend of shapes: B windows, K steps.
+"""
+
+import operator
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.asking.acting import ActingModel
+from lerobot_unimask.asking.given import Given, check_known, check_shown, check_values, give, in_window, read_given
+from lerobot_unimask.asking.memory import RolloutMemory
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import Mask, tabulate
+
+
+def pose_question(
+    model: ActingModel,
+    window: Window | Mapping[str, Tensor] | None,
+    mask: Mask | str,
+    t: int | None,
+    given: Given | None,
+) -> tuple[Window, Mask]:
+    """The window and mask of a question, on the model's device; see `UniMASKPolicy.infer` for arguments and errors."""
+    K = model.config.context_length
+    recorded = window is not None
+    if window is None:
+        rows = (len(token) for token in read_given(given or {}, model.factors, K).values())
+        empty = RolloutMemory(model.factors, K, max(rows, default=1), model.device)
+        window = empty.window(model.statistics.horizon)
+        empty.carry_return(window)
+    elif not isinstance(window, Window):
+        window = model.make_window(window, partial=True)
+    if window.valid.shape[1] != K:
+        raise ValueError(f"The window has {window.valid.shape[1]} steps; this model's have {K}.")
+    window = window.to(model.device)
+    batch_size = len(window.valid)
+    if isinstance(mask, Mask):
+        if mask.causal is not False:
+            raise ValueError("A question's direction follows from what it asks: leave out the Mask's `causal`.")
+        text = mask.draw()
+    else:
+        table = tabulate(mask, tuple(model.factors), K)
+        text, mask = table.question.text, table.at(None if t is None else step_number(t), batch_size)
+    mask = mask.to(model.device).within(window.valid)
+    tokens = read_given(given or {}, model.factors, K, batch_size)
+    for token in tokens:
+        if token.of_episode:
+            raise ValueError(f"{token} is a moment of an episode, for rollouts; here name one of the window, s[3].")
+    known = {}
+    for name, value in window.values.items():
+        lacking = mask.shown[name] & value.isnan().any(-1)  # as in a sample, or a column that is not there
+        known[name] = torch.full((K,), recorded) & ~lacking.any(0).cpu()
+    for token in tokens:  # here the user changes a recorded window on purpose
+        known[token.factor][token.step] = False
+    window, known = give(window, in_window(tokens, 0, K), known)
+    check_shown(tokens, mask.shown, text)
+    check_known(mask, known, text)
+    for name, value in window.values.items():
+        check_values(f"A shown token of {name}", value[mask.shown[name]], model.factors[name])
+    return window, mask
+
+
+def step_number(t: Any) -> int:
+    """
+    Raises:
+        ValueError: it is not a whole number.
+    """
+    try:
+        return operator.index(t)
+    except TypeError as error:
+        raise ValueError(f"t is {t!r}; give the number of a step, as in t=3.") from error

@@ -1,0 +1,104 @@
+"""Clocks, processes of their own, and what machine it is: what every measurement needs.
+
+With a GPU, clocks wait for it, and its peak memory is recorded too.
+"""
+
+import functools
+import multiprocessing
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def alone(label: str, measure: Callable[..., dict[str, Any]], *arguments: Any, **keywords: Any) -> dict[str, Any]:
+    """What a function of this module returns in a process of its own, with that process's seconds and peak memory."""
+    print(f"{label} ...", file=sys.stderr, flush=True)
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([measure.__module__])
+    with ProcessPoolExecutor(1, mp_context=context) as process:
+        return process.submit(_measured, functools.partial(measure, *arguments, **keywords)).result()
+
+
+def _measured(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    began = time.monotonic()
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        record = measure()
+    record["seconds"] = round(time.monotonic() - began, 1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB; on macOS bytes
+    record["peak_memory_mib"] = round(peak / (2**20 if sys.platform == "darwin" else 2**10))
+    if torch.cuda.is_initialized():
+        record["peak_device_memory_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
+    return record
+
+
+class Stopwatch:
+    """When named pieces of work began and how many seconds they took, every time that they were done."""
+
+    def __init__(self) -> None:
+        self.began: dict[str, list[float]] = defaultdict(list)
+        self.seconds: dict[str, list[float]] = defaultdict(list)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        began = now()
+        yield
+        self.began[name].append(began)
+        self.seconds[name].append(now() - began)
+
+    def wrap(self, owner: Any, attribute: str, name: str) -> None:
+        """Time every call of a function from now on, for as long as this process lives."""
+        function = getattr(owner, attribute)
+
+        @functools.wraps(function)
+        def timed(*arguments: Any, **keywords: Any) -> Any:
+            with self(name):
+                return function(*arguments, **keywords)
+
+        setattr(owner, attribute, timed)
+
+
+def now() -> float:
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def spread(values: Sequence[float]) -> dict[str, Any]:
+    low, median, high = np.quantile(np.asarray(values, dtype=float), [0.25, 0.5, 0.75]).tolist()
+    return {"median": median, "quartiles": [low, high], "repeats": len(values)}
+
+
+def machine() -> dict[str, Any]:
+    cpuinfo = Path("/proc/cpuinfo")
+    names = [line.split(":")[1].strip() for line in _lines(cpuinfo) if line.startswith("model name")]
+    return {
+        "processor": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "system": platform.platform(),
+    }
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def commit() -> str | None:
+    """The repository's commit, with `-dirty` where files have been changed since; None: it is no repository."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+    return done.stdout.strip() if done.returncode == 0 else None

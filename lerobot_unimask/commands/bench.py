@@ -1,0 +1,31 @@
+"""`unimask bench`: how fast this machine reads, trains, acts, evaluates and builds."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from lerobot_unimask.commands.flags import add_command
+
+
+def add(commands: Any) -> None:
+    parser = add_command(commands, "bench", "how fast this machine reads, trains, acts, evaluates and builds")
+    parser.add_argument("--configs", type=Path, default=Path("configs"), metavar="DIR", help="default: %(default)s")
+    parser.add_argument("--quick", action="store_true", help="everything once, in a minute, to try the command itself")
+    parser.add_argument(
+        "--output", type=Path, required=True, metavar="FILE.json", help="the record; a picture goes beside it"
+    )
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.bench.measuring import bench
+    from lerobot_unimask.bench.tables import markdown
+    from lerobot_unimask.plots.curves import cost_of_growth
+    from lerobot_unimask.records import write_json
+
+    record = bench(arguments.configs, quick=arguments.quick)
+    print(markdown(record))
+    write_json(arguments.output, {**record, "command": arguments.text})
+    picture = arguments.output.with_suffix(".png")
+    cost_of_growth(record).savefig(picture, dpi=200)
+    print(f"drawn into {picture}")

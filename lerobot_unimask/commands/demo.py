@@ -1,0 +1,20 @@
+"""`unimask demo`: the main job from end to end."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from lerobot_unimask.commands.flags import add_command, positive
+
+
+def add(commands: Any) -> None:
+    parser = add_command(commands, "demo", "build, train, evaluate and question a DoorKey model in a few minutes")
+    parser.add_argument("--output", type=Path, default=Path("unimask-demo"), help="folder to write to; new or empty")
+    parser.add_argument("--steps", type=positive, default=None, help="training updates, for a shorter or longer demo")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.demo import run_demo
+
+    run_demo(arguments.output, **({"steps": arguments.steps} if arguments.steps else {}))

@@ -1,0 +1,93 @@
+"""What the commands share: values, the flags of policies and data, and errors that say which flag was meant."""
+
+import argparse
+import difflib
+from pathlib import Path
+from typing import Any
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse that says which flag was probably meant."""
+
+    def error(self, message: str):
+        if message.startswith("unrecognized arguments:"):
+            known = [flag for action in self._actions for flag in action.option_strings]
+            wrong = message.removeprefix("unrecognized arguments:").split()[0].split("=")[0]
+            near = difflib.get_close_matches(wrong, known, n=1)
+            message += f"\n  Did you mean {near[0]}?" if near else f"\n  This command knows {', '.join(known)}."
+        super().error(message)
+
+    def parse_known_args(self, args=None, namespace=None):
+        """A subcommand reports what it does not know itself, as the parser that knows its flags."""
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown and not self._subparsers:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return namespace, unknown
+
+
+def add_command(commands: Any, name: str, what: str) -> argparse.ArgumentParser:
+    """A subcommand's parser.
+
+    Args:
+        commands: the subparsers that it joins.
+        what: one line of help.
+    """
+    return commands.add_parser(name, help=what, description=what[0].upper() + what[1:] + ".", allow_abbrev=False)
+
+
+def positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
+    return int(text)
+
+
+def boolean(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither true nor false")
+    return text == "true"
+
+
+def policy_flags(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+    """`--policy.path` and `--policy.revision`, as `arguments.path` (a list of `several`) and `arguments.revision`."""
+    what = "a checkpoint, a lerobot-train output folder, of which the last checkpoint counts, or a Hub repository"
+    if several:
+        parser.add_argument(
+            "--policy.path",
+            action="append",
+            required=True,
+            dest="path",
+            metavar="PATH",
+            help="a checkpoint, a lerobot-train output folder, of which the best checkpoint counts, or a Hub "
+            "repository; give it once for each seed",
+        )
+    else:
+        parser.add_argument("--policy.path", required=True, dest="path", metavar="PATH", help=what)
+    parser.add_argument("--policy.revision", dest="revision", metavar="COMMIT", help="of a Hub repository")
+
+
+def dataset_flags(
+    parser: argparse.ArgumentParser, *, required: bool = True, what: str = "the dataset's folder"
+) -> None:
+    """`--dataset.root` and `--dataset.repo_id`, as `arguments.root` and `arguments.repo_id`."""
+    parser.add_argument("--dataset.root", type=Path, dest="root", metavar="DIR", help=what)
+    parser.add_argument("--dataset.repo_id", dest="repo_id", metavar="ME/NAME", help="its name on the Hub")
+    parser.set_defaults(needs_dataset=required)
+
+
+def check_dataset(arguments: argparse.Namespace) -> None:
+    """
+    Raises:
+        ValueError: a command that reads a dataset is told of none.
+    """
+    if getattr(arguments, "needs_dataset", False) and arguments.root is None and arguments.repo_id is None:
+        raise ValueError("Which dataset? Give its folder, --dataset.root=DIR, or its name, --dataset.repo_id=ME/NAME.")
+
+
+def output_flag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--output", type=Path, metavar="FILE.json", help="write the record here")
+
+
+def private_flag(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--private", type=boolean, nargs="?", const=True, metavar="true", help="create the repository as a private one"
+    )

@@ -1,0 +1,39 @@
+"""`unimask measure`: what a policy's answers are worth, on episodes that it was not trained on."""
+
+import argparse
+import json
+from typing import Any
+
+from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags, positive
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "measure", "how far ahead a policy sees, whether its directions agree, how fast it acts"
+    )
+    policy_flags(parser)
+    dataset_flags(parser)
+    parser.add_argument(
+        "--dataset.episodes", required=True, dest="episodes", metavar="900:1000", help="that it was not trained on"
+    )
+    parser.add_argument("--ahead", type=positive, default=5, help="steps to see ahead; default: %(default)s")
+    output_flag(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.data.episodes import episode_numbers, open_dataset
+    from lerobot_unimask.measures import latency, measure
+    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+    from lerobot_unimask.records import versions, write_json
+
+    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
+    dataset = open_dataset(policy.config, arguments.root, arguments.repo_id)
+    episodes = episode_numbers(arguments.episodes, len(dataset.meta.episodes))
+    record = measure(policy, dataset, episodes, ahead=arguments.ahead)
+    record["latency"] = latency(policy)
+    record["policy"] = policy.describe_origin()
+    record["command"], record["versions"] = arguments.text, versions()
+    print(json.dumps(record, indent=2))
+    if arguments.output:
+        write_json(arguments.output, record)

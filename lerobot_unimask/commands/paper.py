@@ -1,0 +1,147 @@
+"""`unimask paper ...`: what only the reproduction of the paper needs."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags, positive
+
+STUDIES = {
+    "heatmap": "the paper's DoorKey heatmap: a grid of runs, shared by workers",
+    "table": "the paper's Maze2D table: a grid of runs, shared by workers",
+    "search": "the paper's random search for hyperparameters: runs shared by workers",
+    "ablation": "what earns its place: variants of one Maze2D model at equal updates",
+}
+
+
+def add(commands: Any) -> None:
+    paper = add_command(commands, "paper", "the paper's tables and figures: heatmap, table, search, gallery, ...")
+    parts = paper.add_subparsers(dest="part", required=True, metavar="PART")
+    for name, what in STUDIES.items():
+        study = add_command(parts, name, what)
+        study.add_argument("--config_path", type=Path, required=True, metavar="YAML", help="as in configs/")
+        study.add_argument("--workers", type=positive, default=1, help="processes to start here; default: %(default)s")
+        study.add_argument(
+            "--storage",
+            metavar="URL",
+            help="database that the study is kept in, such as postgresql://...; default: an SQLite file in the output",
+        )
+        study.set_defaults(run=_study)
+    _add_curve(parts)
+    _add_questions(parts)
+    _add_gallery(parts)
+
+
+def _add_curve(parts: Any) -> None:
+    curve = add_command(parts, "curve", "return of each checkpoint of a run, by LeRobot's evaluation")
+    curve.add_argument("--run", type=Path, action="append", required=True, dest="runs", metavar="DIR")
+    curve.add_argument("--env.type", required=True, dest="env_type", metavar="ENVIRONMENT")
+    curve.add_argument("--episodes", type=positive, default=200, help="rollouts of each checkpoint")
+    curve.add_argument("--last_episodes", type=positive, default=1000, help="rollouts of the last one")
+    curve.add_argument("--batch_size", type=positive, default=100, help="environments side by side")
+    curve.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
+    curve.add_argument("--output", type=Path, required=True, help="JSON record; a picture goes beside it")
+    curve.set_defaults(run=_curve)
+
+
+def _add_questions(parts: Any) -> None:
+    questions = add_command(
+        parts, "questions", "how often a DoorKey policy does what it is asked: goals, returns, a property, samples"
+    )
+    policy_flags(questions)
+    dataset_flags(questions, what="unseen episodes")
+    questions.add_argument("--each", type=positive, default=10, help="rollouts for each goal and return from a start")
+    questions.add_argument("--samples", type=positive, default=4000, help="drawn in each order")
+    questions.add_argument("--seed", type=int, default=0)
+    output_flag(questions)
+    questions.set_defaults(run=_questions)
+
+
+def _add_gallery(parts: Any) -> None:
+    gallery = add_command(parts, "gallery", "draw the pictures of docs/gallery.md")
+    policy_flags(gallery)
+    dataset_flags(gallery, what="DoorKey episodes")
+    gallery.add_argument("--maze.path", dest="maze_path", metavar="PATH", help="a Maze2D policy, for its picture")
+    gallery.add_argument("--maze.root", type=Path, dest="maze_root", metavar="DIR", help="Maze2D episodes")
+    gallery.add_argument("--output", type=Path, default=Path("docs"), help="folder of gallery.md; default: docs")
+    gallery.set_defaults(run=_gallery)
+
+
+def _study(arguments: argparse.Namespace) -> None:
+    try:
+        import optuna  # noqa: F401
+    except ImportError as error:
+        raise ValueError("Studies need the extra: pip install 'lerobot_policy_unimask[paper]'.") from error
+    from lerobot_unimask.paper import ablation, heatmap, search, table
+    from lerobot_unimask.paper.study import read_config
+
+    kind, run, markdown = {
+        "heatmap": (heatmap.HeatmapConfig, heatmap.heatmap, heatmap.markdown),
+        "table": (table.TableConfig, table.table, table.markdown),
+        "search": (search.SearchConfig, search.search, search.markdown),
+        "ablation": (ablation.AblationConfig, ablation.ablation, ablation.markdown),
+    }[arguments.part]
+    config = read_config(kind, arguments.config_path)
+    print(markdown(run(config, storage=arguments.storage, workers=arguments.workers)))
+    print(f"written to {config.output}")
+
+
+def _curve(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.paper.learning_curve import learning_curve
+    from lerobot_unimask.plots.curves import learning_curves
+    from lerobot_unimask.records import write_json
+
+    record = learning_curve(
+        arguments.runs,
+        arguments.env_type,
+        episodes=arguments.episodes,
+        last_episodes=arguments.last_episodes,
+        batch_size=arguments.batch_size,
+        seed=arguments.seed,
+    )
+    write_json(arguments.output, {**record, "command": arguments.text})
+    picture = arguments.output.with_suffix(".png")
+    learning_curves(record).savefig(picture, dpi=200)
+    print(f"drawn into {picture}")
+
+
+def _questions(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.data.checkpoints import training_settings
+    from lerobot_unimask.data.episodes import first_windows, open_dataset, provenance_of
+    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+    from lerobot_unimask.paper.questions import ask_everything, summary
+    from lerobot_unimask.records import write_json
+
+    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
+    dataset = open_dataset(policy.config, arguments.root, arguments.repo_id)
+    expert = provenance_of(Path(dataset.root)).get("expert", "paper")
+    settings = {"each": arguments.each, "samples": arguments.samples, "seed": arguments.seed, "expert": expert}
+    record = ask_everything(policy, first_windows(dataset), **settings)
+    record["policy"] = policy.describe_origin()
+    record["training"] = training_settings(Path(policy.origin.repository))
+    print(summary(record))
+    if arguments.output:
+        write_json(arguments.output, {**record, "command": arguments.text})
+
+
+def _gallery(arguments: argparse.Namespace) -> None:
+    if (arguments.maze_path is None) != (arguments.maze_root is None):
+        raise ValueError("--maze.path and --maze.root go together: give both or neither.")
+    from itertools import chain
+
+    from lerobot_unimask.data.episodes import first_windows, middle_windows, open_dataset, provenance_of
+    from lerobot_unimask.envs.maze2d.record import maze_of
+    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+    from lerobot_unimask.paper.gallery import doorkey_pictures, maze_pictures, write_gallery
+
+    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
+    batch = first_windows(open_dataset(policy.config, arguments.root, arguments.repo_id))
+    pictures = doorkey_pictures(policy, batch)
+    if arguments.maze_path is not None:
+        maze = UniMASKPolicy.from_pretrained(arguments.maze_path)
+        dataset = open_dataset(maze.config, arguments.maze_root)
+        pictures = chain(
+            pictures, maze_pictures(maze, middle_windows(dataset), walls=maze_of(provenance_of(Path(dataset.root))))
+        )
+    for path in write_gallery(pictures, arguments.output, command=arguments.text):
+        print(path)

@@ -1,0 +1,29 @@
+"""`unimask validate`: the validation loss of each task."""
+
+import argparse
+from typing import Any
+
+from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags
+
+
+def add(commands: Any) -> None:
+    parser = add_command(commands, "validate", "validation loss of each task, as in the paper's heatmap")
+    policy_flags(parser, several=True)
+    dataset_flags(parser)
+    parser.add_argument(
+        "--exact", metavar="EXPERT", help="set the exact optimum beside the models, for data of this expert (DoorKey)"
+    )
+    output_flag(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.records import write_json
+    from lerobot_unimask.validation import summary, validate
+
+    record = validate(
+        arguments.path, arguments.root, arguments.repo_id, exact=arguments.exact, revision=arguments.revision
+    )
+    print(summary(record))
+    if arguments.output:
+        write_json(arguments.output, {**record, "command": arguments.text})

@@ -1,0 +1,56 @@
+"""Policies beside DoorKey's exact optimum, on the same windows and masks."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lerobot_unimask.envs.doorkey.expert import Expert
+from lerobot_unimask.envs.doorkey.optimum import (
+    Optimum,
+    check_features,
+    divergences,
+    entropies,
+    mean_over_asked,
+    random_mask_divergence,
+)
+from lerobot_unimask.language.masks import RANDOM_MASK
+from lerobot_unimask.language.training_masks import validation_masks
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.networks.losses import masked_losses
+
+
+@torch.no_grad()
+def beside_optimum(
+    policies: Sequence[UniMASKPolicy], batch: dict[str, Tensor], masks: Sequence[str], expert: Expert
+) -> tuple[dict, list[dict]]:
+    """DoorKey's exact optimum on the windows and masks of `task_losses`, and how far from it each policy is.
+
+    Returns:
+        The optimum's record: its loss on each task, and the loss that it expects, which no model can beat but by
+        chance; and for each policy, each task's mean Kullback-Leibler divergence from the exact marginals to its own,
+        components added up, and that over many random masks by kind of token and by how much is hidden.
+
+    Raises:
+        ValueError: the policies' features are not DoorKey's.
+    """
+    check_features(policies[0].config.features)
+    optimum = Optimum(expert)
+    window = policies[0].make_window(batch)
+    index = batch["index"].to(policies[0].device)
+    record: dict = {"expert": expert, "losses": {}, "expected_losses": {}}
+    distances: list[dict] = [{"divergence": {}} for _ in policies]
+    normalised = [policy.eval().statistics.normalise(window) for policy in policies]
+    for text in masks:
+        mask = validation_masks(text, tuple(policies[0].factors), window.valid, index)
+        exact = optimum.predict(window, mask)
+        parts = masked_losses(exact, window, mask.asked, policies[0].factors)
+        record["losses"][text] = sum(part.item() for part in parts.values())
+        record["expected_losses"][text] = mean_over_asked(entropies(exact), mask.asked)
+        for policy, values, distance in zip(policies, normalised, distances, strict=True):
+            predictions = policy.predict(values, mask)
+            distance["divergence"][text] = mean_over_asked(divergences(exact, predictions), mask.asked)
+    if RANDOM_MASK in masks:
+        for policy, values, distance in zip(policies, normalised, distances, strict=True):
+            distance["random_mask_divergence"] = random_mask_divergence(optimum, policy, window, values, index)
+    return record, distances

@@ -1,0 +1,48 @@
+"""Maze2D's record, for the rest of the package."""
+
+import numpy as np
+from lerobot.utils.constants import ACTION, OBS_STATE
+from matplotlib.figure import Figure
+
+from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.sampling import Samples
+from lerobot_unimask.data.window import Window
+from lerobot_unimask.envs.maze2d.maze import ENV_ID, HORIZON
+from lerobot_unimask.envs.maze2d.pictures import draw_ways, maze_trajectories
+from lerobot_unimask.envs.record import Environment, Provenance
+from lerobot_unimask.language.masks import Mask
+
+
+def _draw_answer(
+    question: str, answer: Answer | Samples, mask: Mask, recorded: Window | None, provenance: Provenance
+) -> Figure | None:
+    """Where the mass is over the maze, if states are asked."""
+    if isinstance(answer, Samples) or not mask.asked["s"].any():
+        return None
+    return maze_trajectories(answer, recorded, maze=maze_of(provenance))
+
+
+def _draw_episodes(states: np.ndarray, provenance: Provenance) -> Figure:
+    return draw_ways(states, maze_of(provenance))
+
+
+def maze_of(provenance: Provenance) -> str:
+    """The maze, a name or text, that a dataset was built in."""
+    return provenance.get("maze", "medium")
+
+
+MAZE2D = Environment(
+    type="maze2d",
+    env_id=ENV_ID,
+    state_names=("x", "y", "goal_x", "goal_y"),
+    horizon=HORIZON,
+    description="Maze2D, a point mass in a maze on MuJoCo, its velocity hidden. Every episode has 200 steps.",
+    expert="a waypoint controller with normal noise on its actions",
+    reward="by how much the distance to the goal shrank, in cells",
+    columns={
+        OBS_STATE: "the position and the goal's, x and y each, in cells",
+        ACTION: "the force along x and y, each in [-1, 1]",
+    },
+    draw_episodes=_draw_episodes,
+    draw_answer=_draw_answer,
+)

@@ -1,0 +1,91 @@
+"""Every change that importing this plugin makes to LeRobot, each with its reason and with what happens to other
+policies.
+
+`UNIMASK_PATCH_LEROBOT=0` in the environment turns all of them off.
+"""
+
+import functools
+import os
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.errors import LocalEntryNotFoundError
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import dataset_metadata, factory, lerobot_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.data._utils.collate import default_collate_fn_map
+
+from lerobot_unimask.data import reads
+from lerobot_unimask.sharing import hub
+
+ENVIRONMENT_VARIABLE = "UNIMASK_PATCH_LEROBOT"
+
+
+def apply() -> None:
+    """Make the changes, here and in processes that datasets are pickled to. Does nothing the second time."""
+    if os.environ.get(ENVIRONMENT_VARIABLE) == "0" or hasattr(LeRobotDataset, "__getitems__"):
+        return
+    _read_windows_in_batches()
+    _refuse_streams()
+    _work_offline()
+
+
+def _read_windows_in_batches() -> None:
+    """LeRobotDataset reads item by item, 2 to 11 ms a window; PyTorch's DataLoader asks a dataset that has
+    `__getitems__` for whole batches.
+
+    Other policies: their batches are equal in keys, dtypes, shapes and values, and come faster; a test compares them.
+    """
+    state_of = LeRobotDataset.__getstate__
+    LeRobotDataset.__getitems__ = property(reads.batched_read)
+    LeRobotDataset.__getstate__ = lambda self: {**state_of(self), "_patches": _ApplyWhereUnpickled()}
+    default_collate_fn_map[reads.Item] = reads.collate_windows
+
+
+class _ApplyWhereUnpickled:
+    """Travels in a pickled dataset: spawned DataLoader workers import no plugin, but unpickle the dataset."""
+
+    def __reduce__(self):
+        return apply, ()
+
+
+def _refuse_streams() -> None:
+    """LeRobot 0.6.1's streams fail on windows of a feature of shape (1,), give nothing at all, and wait for ever, with
+    `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`.
+
+    Other policies: unchanged.
+    """
+    lerobots_make_dataset = factory.make_dataset
+
+    @functools.wraps(lerobots_make_dataset)
+    def make_dataset(cfg: TrainPipelineConfig) -> LeRobotDataset:
+        if cfg.dataset.streaming and cfg.trainable_config.type == "unimask":
+            raise ValueError(
+                "unimask does not train on streamed datasets: LeRobot's streams do not give it whole windows. Leave "
+                "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
+                "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
+            )
+        return lerobots_make_dataset(cfg)
+
+    factory.make_dataset = make_dataset
+
+
+def _work_offline() -> None:
+    """With HF_HUB_OFFLINE=1 LeRobot asks the Hub for a dataset's versions even if it has the dataset, and reads a
+    policy's config, whatever its type, before it calls the policy: what is missing is named in one sentence.
+
+    Other policies: the same, offline; online nothing changes but the sentence for a policy that is not there.
+    """
+    dataset_metadata.get_safe_version = lerobot_dataset.get_safe_version = hub.pulled_version
+    read = PreTrainedConfig.from_pretrained.__func__
+
+    @functools.wraps(read)
+    def read_or_name(cls: type, pretrained_name_or_path: str | Path, **kwargs: Any) -> PreTrainedConfig:
+        try:
+            return read(cls, pretrained_name_or_path, **kwargs)
+        except LocalEntryNotFoundError:
+            with hub.pull_errors(str(pretrained_name_or_path), kwargs.get("revision")):
+                raise
+
+    PreTrainedConfig.from_pretrained = classmethod(read_or_name)

@@ -1,0 +1,169 @@
+"""Checkpoints: saved, loaded, refused, gone on with."""
+
+import json
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_policy
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same_answers, roll
+from safetensors.torch import load_file, save_file
+
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+
+
+def test_a_loaded_policy_gives_the_same_answers(kind, layout, tiny_policy, batch_of, tmp_path, states):
+    policy, batch = tiny_policy(kind, **LAYOUTS[layout], training_masks=["multi_task", "random_mask"]), batch_of(kind)
+    for _ in range(5):
+        policy.update()
+    policy.save_pretrained(tmp_path)
+    loaded = UniMASKPolicy.from_pretrained(tmp_path)
+    assert not loaded.training
+    assert loaded.updates.item() == 5
+    assert loaded.config.features == policy.config.features
+    assert_same_answers(loaded.infer(batch, "future", t=3), policy.infer(batch, "future", t=3))
+    if kind != "doorkey":
+        assert torch.equal(roll(loaded, states), roll(policy, states))
+    assert torch.equal(loaded.train().forward(batch)[0], policy.train().forward(batch)[0])  # the masks go on, too
+
+
+def test_training_masks_after_a_restart_are_those_of_an_uninterrupted_run(tiny_policy, doorkey_batch, tmp_path):
+    def losses(policy, count):
+        optimiser = torch.optim.SGD(policy.parameters(), lr=0.1)
+        policy.train()
+        seen = []
+        for _ in range(count):
+            loss, _ = policy.forward(doorkey_batch)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            policy.update()
+            seen.append(loss.item())
+        return seen
+
+    uninterrupted = losses(tiny_policy(), 6)
+    policy = tiny_policy()
+    first = losses(policy, 3)
+    policy.save_pretrained(tmp_path)
+    torch.manual_seed(99)
+    assert first + losses(UniMASKPolicy.from_pretrained(tmp_path), 3) == uninterrupted
+
+
+def spoil(folder, change):
+    weights = load_file(folder / "model.safetensors")
+    change(weights)
+    save_file(weights, folder / "model.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w: w.pop("network.norm.weight"), r"missing network\.norm\.weight"),
+        (lambda w: w.pop("statistics.a_mean"), r"missing statistics\.a_mean"),
+        (lambda w: w.update(surplus=torch.zeros(1)), "extra surplus"),
+        (
+            lambda w: w.update({"network.positions": torch.zeros(7, 16)}),
+            r"network\.positions has shape \(7, 16\) instead of",
+        ),
+    ],
+)
+def test_other_weights_are_refused_by_name(tiny_policy, tmp_path, change, message):
+    tiny_policy().save_pretrained(tmp_path)
+    spoil(tmp_path, change)
+    for strict in (True, False):
+        with pytest.raises(ValueError, match=message):
+            UniMASKPolicy.from_pretrained(tmp_path, strict=strict)
+
+
+def test_every_fault_of_the_weights_is_named_at_once(tiny_policy, tmp_path):
+    tiny_policy().save_pretrained(tmp_path)
+    spoil(tmp_path, lambda w: (w.pop("updates"), w.update(surplus=torch.zeros(1))))
+    with pytest.raises(ValueError, match=r"missing updates; extra surplus"):
+        UniMASKPolicy.from_pretrained(tmp_path)
+
+
+def test_a_truncated_or_absent_file_is_refused(tiny_policy, tmp_path):
+    tiny_policy().save_pretrained(tmp_path)
+    file = tmp_path / "model.safetensors"
+    content = file.read_bytes()
+    for length in (len(content) - 100, 20, 0):
+        file.write_bytes(content[:length])
+        with pytest.raises(ValueError, match=r"model\.safetensors cannot be read"):
+            UniMASKPolicy.from_pretrained(tmp_path)
+    file.unlink()
+    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read"):
+        UniMASKPolicy.from_pretrained(tmp_path)
+
+
+RESCALED = {
+    key: {name: [10 * number for number in numbers] for name, numbers in entry.items()}
+    for key, entry in CONTINUOUS_STATS.items()
+}
+
+
+def test_fine_tuning_takes_the_new_datasets_statistics(tiny_policy, tmp_path, continuous_batch):
+    policy = tiny_policy("continuous")
+    policy.save_pretrained(tmp_path)
+    kept = UniMASKPolicy.from_pretrained(tmp_path)
+    assert torch.equal(kept.statistics.s_mean, policy.statistics.s_mean)
+    stats = RESCALED | {"frame_index": {"max": [49.0]}, "timestamp": {"max": [4.9]}}
+    tuned = UniMASKPolicy.from_pretrained(tmp_path, dataset_stats=stats)
+    torch.testing.assert_close(tuned.statistics.s_mean, 10 * policy.statistics.s_mean)
+    torch.testing.assert_close(tuned.statistics.a_std, 10 * policy.statistics.a_std)
+    # The same windows in other units have the same answers in those units. (A constant is not scaled.)
+    rescaled = {key: 10 * value if key in CONTINUOUS_FEATURES else value for key, value in continuous_batch.items()}
+    rescaled["observation.state"][..., 2] = 5.0 + (continuous_batch["observation.state"][..., 2] - 0.5)
+    before = policy.infer(continuous_batch, "a[:] | s[0], s[-1], rtg[0]").most_likely("a")
+    after = tuned.infer(rescaled, "a[:] | s[0], s[-1], rtg[0]").most_likely("a")
+    torch.testing.assert_close(after.nan_to_num(0), 10 * before.nan_to_num(0), rtol=1e-4, atol=1e-3)
+
+
+def test_make_policy_goes_on_from_a_checkpoint(tiny_policy, doorkey, tmp_path):
+    tiny_policy().save_pretrained(tmp_path)
+    config = UniMASKConfig.from_pretrained(tmp_path)
+    config.pretrained_path = tmp_path
+    policy = make_policy(config, ds_meta=doorkey.meta)
+    assert policy.config.features == tiny_policy().config.features
+    assert torch.equal(policy.network.positions, tiny_policy().network.positions)
+
+
+def test_at_evaluation_the_environment_does_not_change_the_model(tiny_policy, tmp_path):
+    from lerobot_unimask.envs.configs import DoorKeyEnvConfig
+
+    tiny_policy().save_pretrained(tmp_path)
+    config = UniMASKConfig.from_pretrained(tmp_path)
+    config.pretrained_path = tmp_path
+    policy = make_policy(config, env_cfg=DoorKeyEnvConfig())
+    assert list(policy.factors) == ["s", "a", "rtg"]
+    assert policy.config.output_features["action"] == PolicyFeature(FeatureType.ACTION, (1,))
+    assert policy.select_action({"observation.state": torch.zeros(2, 2)}).dtype == torch.int64
+
+
+def test_a_checkpoint_says_what_it_is_in_plain_json(tiny_policy, tmp_path):
+    tiny_policy(training_masks={"past": 2.0, "random_mask": 1.0}).save_pretrained(tmp_path)
+    stored = json.loads((tmp_path / "config.json").read_text())
+    assert stored["type"] == "unimask"
+    assert stored["training_masks"] == {"past": 2.0, "random_mask": 1.0}
+    assert stored["features"]["s"] == [
+        {"key": "observation.state", "size": 2, "categories": [16, 16], "names": ["agent_cell", "key_cell"]}
+    ]
+
+
+def test_a_checkpoint_keeps_how_its_training_episodes_began(tmp_path, doorkey_root, tiny_policy):
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.factory import make_policy
+
+    meta = LeRobotDatasetMetadata("local/doorkey", root=doorkey_root)
+    config = tiny_policy(target_return="auto", inference_mask="reward_conditioned").config
+    config.features = {}
+    make_policy(config, ds_meta=meta).save_pretrained(tmp_path)
+    loaded = UniMASKPolicy.from_pretrained(tmp_path)
+    dataset = LeRobotDataset("local/doorkey", root=doorkey_root)
+    firsts = [dataset[start] for start in meta.episodes["dataset_from_index"]]
+    torch.testing.assert_close(
+        loaded.episode_starts.states, torch.stack([f["observation.state"] for f in firsts]).float()
+    )
+    torch.testing.assert_close(
+        loaded.episode_starts.returns, torch.stack([f["observation.return_to_go"] for f in firsts]).flatten()
+    )
