@@ -1,6 +1,7 @@
 """The policy's one config dataclass, `--policy.type=unimask`."""
 
 import json
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,10 @@ from lerobot_unimask.data.factors import (
 from lerobot_unimask.language.grammar import MAX_CONTEXT
 from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK, parse
 from lerobot_unimask.language.training_masks import mixture
+from lerobot_unimask.machine import has_bfloat16
 from lerobot_unimask.records import read_json
+
+logger = logging.getLogger(__name__)
 
 # Each network with the ways in which it can attend, its default first
 NETWORKS = {
@@ -172,6 +176,9 @@ class UniMASKConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.use_amp and not has_bfloat16(self.device):
+            logger.warning("use_amp does not help here: this processor has no bfloat16 arithmetic. Using float32.")
+            self.use_amp = False
         if not 1 <= self.context_length <= MAX_CONTEXT:
             raise ValueError(f"context_length is {self.context_length}; it must lie in 1 to {MAX_CONTEXT} steps.")
         if not 1 <= self.chunk_size <= self.context_length:
@@ -233,6 +240,11 @@ class UniMASKConfig(PreTrainedConfig):
         parse(self.inference_mask)
 
     # LeRobot's contract
+
+    @property
+    def dtype(self) -> str:
+        """What lerobot-train computes in; without it, `use_amp` on a GPU would be float16."""
+        return "bfloat16" if self.use_amp else "float32"
 
     @property
     def observation_delta_indices(self) -> list[int]:

@@ -189,5 +189,5 @@ Done in {seconds:.0f} s; everything is in {output}. Look at {output}/five_panels
       --policy.inference_mask='a[t] | s[:t+1], a[:t], s[-1]' --policy.given='{{"s[-1]": [12, 12]}}'
   uv run lerobot-train --policy.path={checkpoint} --policy.push_to_hub=false --policy.training_masks=behavior_cloning \\
       --dataset.repo_id=local/doorkey --dataset.root={output}/data --steps=500 --num_workers=0
-  uv run unimask validate --run={output}/train --dataset.root={output}/data_unseen
+  uv run unimask validate --policy.path={output}/train --dataset.root={output}/data_unseen
 """)

@@ -5,6 +5,7 @@ policies.
 """
 
 import functools
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from lerobot_unimask.data import reads
 from lerobot_unimask.sharing import hub
 
+logger = logging.getLogger(__name__)
+
 ENVIRONMENT_VARIABLE = "UNIMASK_PATCH_LEROBOT"
 
 
@@ -27,7 +30,7 @@ def apply() -> None:
     if os.environ.get(ENVIRONMENT_VARIABLE) == "0" or hasattr(LeRobotDataset, "__getitems__"):
         return
     _read_windows_in_batches()
-    _refuse_streams()
+    _read_as_this_policy_needs()
     _work_offline()
 
 
@@ -50,9 +53,11 @@ class _ApplyWhereUnpickled:
         return apply, ()
 
 
-def _refuse_streams() -> None:
-    """LeRobot 0.6.1's streams fail on windows of a feature of shape (1,), give nothing at all, and wait for ever, with
-    `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`.
+def _read_as_this_policy_needs() -> None:
+    """Streams are refused: LeRobot 0.6.1's fail on windows of a feature of shape (1,), give nothing at all, and wait
+    for ever, with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`. And a dataset that
+    is read in batches gets no DataLoader workers, of which LeRobot starts four: each imports LeRobot first, some 20 s,
+    for batches that take a millisecond, and from the second epoch on they see another order of the data.
 
     Other policies: unchanged.
     """
@@ -66,7 +71,11 @@ def _refuse_streams() -> None:
                 "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
                 "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
             )
-        return lerobots_make_dataset(cfg)
+        dataset = lerobots_make_dataset(cfg)
+        if cfg.trainable_config.type == "unimask" and cfg.num_workers and getattr(dataset, "__getitems__", None):
+            logger.info("Windows are read in batches, faster than workers start: num_workers=0.")
+            cfg.num_workers = 0
+        return dataset
 
     factory.make_dataset = make_dataset
 

@@ -31,6 +31,7 @@ from lerobot_unimask.data.window import Statistics, Window, make_window
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
+from lerobot_unimask.machine import keep_freed_memory
 from lerobot_unimask.networks import make_network
 from lerobot_unimask.networks.layers import Cache, Predictions
 from lerobot_unimask.networks.losses import LossParts, masked_losses
@@ -67,10 +68,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         if config.image_features:
-            logger.warning(
-                "unimask ignores the camera features %s; LeRobot decodes them all the same.",
-                ", ".join(config.image_features),
-            )
+            names = ", ".join(config.image_features)
+            logger.warning("unimask ignores the camera features %s; LeRobot decodes them all the same.", names)
         self.factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
         check_settings(config, self.factors)
         self.statistics = Statistics(config.features, self.factors, config.context_length)
@@ -131,11 +130,17 @@ class UniMASKPolicy(PreTrainedPolicy):
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
         return loss, LossParts({f"loss_{name}": part.detach() for name, part in losses.items()})
 
+    def train(self, mode: bool = True) -> "UniMASKPolicy":
+        """As PyTorch's; on a processor, training begins with glibc told to keep freed memory."""
+        if mode and self.device.type == "cpu":
+            keep_freed_memory()
+        return super().train(mode)
+
     def update(self) -> None:
         """Count an update; LeRobot calls this after each optimiser step."""
         self.updates += 1
 
-    def get_optim_params(self):
+    def get_optim_params(self) -> Iterator[torch.nn.Parameter]:
         return self.parameters()
 
     # --- Asking ------------------------------------------------------------------------------------------------------
@@ -171,7 +176,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         return predictions
 
     def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
-        """A LeRobot batch as a window of this model, in the dataset's units; see `window.make_window`."""
+        """A LeRobot batch as a window of this model, in the dataset's units; see `data.window.make_window`."""
         return make_window(
             {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)},
             self.config.features,

@@ -109,7 +109,7 @@ class Trainer:
 
     def _update(self, batch: dict[str, Any]) -> float:
         self.policy.train()
-        with torch.autocast(self.policy.device.type, enabled=self.policy.config.use_amp):
+        with torch.autocast(self.policy.device.type, torch.bfloat16, enabled=self.policy.config.use_amp):
             loss, _ = self.policy.forward(batch)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.grad_clip_norm)

@@ -2,10 +2,10 @@
 
 import json
 import logging
-import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import pytest
 import torch
 
@@ -26,14 +26,6 @@ def dataset(root: Path) -> list[str]:
     return ["--dataset.repo_id=local/doorkey", f"--dataset.root={root}"]
 
 
-def command(name: str, *arguments: str, cwd: Path) -> str:
-    """Run a console script as a user would and return what it printed."""
-    script = Path(sys.executable).with_name(name)
-    done = subprocess.run([script, *arguments], cwd=cwd, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout + done.stderr
-
-
 def in_process(script: str, *arguments: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same main function without paying for LeRobot's import again."""
     from lerobot.scripts import lerobot_eval, lerobot_train
@@ -48,7 +40,9 @@ def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     folder = tmp_path_factory.mktemp("train")
     flags = ["--steps=4", "--batch_size=8", "--dataset.eval_split=0.25", "--eval_steps=2", "--save_freq=2"]
     flags += ["--log_freq=1", "--env.type=doorkey", "--env_eval_freq=4", "--eval.n_episodes=3", "--eval.batch_size=3"]
-    log = command("lerobot-train", *TRAIN, *dataset(root), *flags, "--num_workers=1", "--output_dir=run", cwd=folder)
+    log = commands.check(
+        "lerobot-train", *TRAIN, *dataset(root), *flags, "--num_workers=1", "--output_dir=run", cwd=folder
+    )
     return folder / "run", log
 
 
@@ -65,7 +59,7 @@ def test_lerobot_train_trains_validates_evaluates_and_saves(trained: tuple[Path,
 
 def test_lerobot_eval_with_other_questions(trained: tuple[Path, str], tmp_path: Path) -> None:
     checkpoint = trained[0] / "checkpoints/last/pretrained_model"
-    log = command(
+    log = commands.check(
         "lerobot-eval",
         f"--policy.path={checkpoint}",
         "--env.type=doorkey",

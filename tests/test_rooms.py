@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 # From the ground up; a folder stands for what is in it, in the order of the list where that names its files.
 FLOORS = [
     "lerobot_unimask/records.py",
+    "lerobot_unimask/machine.py",
     "lerobot_unimask/language/grammar.py",
     "lerobot_unimask/language/masks.py",
     "lerobot_unimask/language/training_masks.py",

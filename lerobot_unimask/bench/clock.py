@@ -6,7 +6,6 @@ With a GPU, clocks wait for it, and its peak memory is recorded too.
 import functools
 import multiprocessing
 import os
-import platform
 import resource
 import subprocess
 import sys
@@ -78,23 +77,6 @@ def now() -> float:
 def spread(values: Sequence[float]) -> dict[str, Any]:
     low, median, high = np.quantile(np.asarray(values, dtype=float), [0.25, 0.5, 0.75]).tolist()
     return {"median": median, "quartiles": [low, high], "repeats": len(values)}
-
-
-def machine() -> dict[str, Any]:
-    cpuinfo = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in _lines(cpuinfo) if line.startswith("model name")]
-    return {
-        "processor": names[0] if names else platform.processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "system": platform.platform(),
-    }
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
 
 
 def commit() -> str | None:

@@ -6,9 +6,7 @@ are untrained, which costs the same. With a GPU, clocks wait for it and its peak
 been tried for want of one.
 """
 
-import ctypes
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,11 +34,12 @@ from torch.utils.data import default_collate
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import HORIZON, build_maze2d, building_seconds, stepping_seconds
 from lerobot_unimask import evaluating as lerobot_evaluation
-from lerobot_unimask.bench.clock import Stopwatch, alone, commit, machine, now, spread
+from lerobot_unimask.bench.clock import Stopwatch, alone, commit, now, spread
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import RETURN_SO_FAR
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.machine import describe_machine
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.transformer import Transformer
 from lerobot_unimask.records import versions
@@ -117,7 +116,7 @@ def bench(configs: Path, *, quick: bool = False) -> dict[str, Any]:
     record: dict[str, Any] = {
         "what": "medians and quartiles over repetitions; peak memory of each measurement's own process",
         "quick": quick,
-        "machine": machine(),
+        "machine": describe_machine(),
         "load_at_start": round(load, 2),  # processes that wanted a core: above 0 other work disturbed what follows
         "commit": commit(),
         "versions": versions(),
@@ -167,8 +166,6 @@ def _training(size: Size, configs: Path, roots: Mapping[str, Path]) -> dict[str,
         "maze2d, float32": ("maze2d", ["--policy.use_amp=false"], {}),
         "maze2d, float32, explicit attention": ("maze2d", ["--policy.use_amp=false"], {"explicit_attention": True}),
     }
-    if platform.libc_ver()[0] == "glibc":
-        variants["maze2d, freed memory kept"] = ("maze2d", [], {"freed_memory_kept": True})
     found = {}
     for name, (config, arguments, changes) in variants.items():
         updates = size.slow_updates if "batched_reads" in changes else size.updates
@@ -225,7 +222,6 @@ def training(
     *,
     batched_reads: bool = True,
     explicit_attention: bool = False,
-    freed_memory_kept: bool = False,
 ) -> dict[str, Any]:
     """lerobot-train itself, without checkpoints and evaluations: an update's time and what it is spent on.
 
@@ -247,10 +243,6 @@ def training(
             yield batch
 
     lerobot_train.cycle = timed_cycle
-    if freed_memory_kept:  # as the README's two environment variables have it from the start
-        libc, mmap_threshold, trim_threshold = ctypes.CDLL(None), -3, -1  # as in malloc.h
-        libc.mallopt(mmap_threshold, 2**25)
-        libc.mallopt(trim_threshold, 10**9)
     if not batched_reads:
         LeRobotDataset.__getitems__ = None  # in this process, which measures nothing else
     with tempfile.TemporaryDirectory() as folder:
