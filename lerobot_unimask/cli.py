@@ -1,5 +1,6 @@
 """`unimask COMMAND ...`: what LeRobot's own commands do not do. Training and evaluation are lerobot-train and -eval."""
 
+import importlib
 import logging
 import shlex
 import sys
@@ -33,6 +34,7 @@ def main(argv: list[str] | None = None) -> None:
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         check_dataset(arguments)
+        importlib.import_module("lerobot_policy_unimask")  # as LeRobot's own commands do
         arguments.run(arguments)
     except KeyboardInterrupt:
         sys.exit("unimask: interrupted")

@@ -8,11 +8,15 @@ import pytest
 import torch
 from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, KINDS, LAYOUTS, Episode
 
-import lerobot_policy_unimask  # noqa: F401 (registers policy and environments, as LeRobot's discovery does)
-
 torch.set_num_threads(1)  # two threads beside another busy process are many times slower than one
 
 EPISODES = 30
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plugin():
+    """Policy and environments are registered, as by LeRobot's discovery."""
+    import lerobot_policy_unimask  # noqa: F401 (not above: hub_flow.py sets up what huggingface_hub reads first)
 
 
 @pytest.fixture(scope="session")

@@ -205,7 +205,10 @@ def answers(policy: UniMASKPolicy) -> list[torch.Tensor]:
     policy.reset()
     states = torch.tensor([[0.0, 5.0], [5.0, 0.0], [1.0, 8.0]])
     batch = {"observation.state": states, "observation.return_so_far": torch.zeros(3, 1)}
-    acted = [policy.select_action(batch), policy._choose_target(states)]
+    acted = [
+        policy.select_action(batch),
+        policy.config.target_return_scale * policy.episode_starts.nearest_return(states),
+    ]
     return [*(part.probabilities for part in marginals), *drawn.values(), *acted]
 
 
@@ -387,7 +390,10 @@ def test_of_two_pushes_at_once_one_is_there_and_the_other_is_told(checkpoint: Pa
         policy.updates.fill_(100 + number)
         policy.save_pretrained(HOME / f"both_{number}")
         policies.append((policy, HOME / f"both_{number}"))
-    from lerobot_unimask.sharing.hub import push_policy
+    from lerobot_unimask.sharing import cards, hub
+
+    def push_policy(policy: UniMASKPolicy, folder: Path, repo_id: str) -> None:
+        hub.push_policy(folder, repo_id, cards.policy_card(policy.card_facts(folder), repo_id))
 
     barrier, ended = threading.Barrier(2), [None, None]
 

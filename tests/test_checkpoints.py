@@ -1,15 +1,17 @@
 """Checkpoints: saved, loaded, refused, gone on with."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import make_policy
 from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same_answers, roll
 from safetensors.torch import load_file, save_file
 
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+from lerobot_unimask.data.checkpoints import last_checkpoint
 
 
 def test_a_loaded_policy_gives_the_same_answers(kind, layout, tiny_policy, batch_of, tmp_path, states):
@@ -167,3 +169,84 @@ def test_a_checkpoint_keeps_how_its_training_episodes_began(tmp_path, doorkey_ro
     torch.testing.assert_close(
         loaded.episode_starts.returns, torch.stack([f["observation.return_to_go"] for f in firsts]).flatten()
     )
+
+
+# --- Checkpoints of format 1 -----------------------------------------------------------------------------------------
+
+FORMAT_1 = sorted((Path(__file__).parent / "data").glob("format1_*"))
+
+
+def scores(answer):
+    return [getattr(d, "probabilities", getattr(d, "mean", None))[0] for name in ("s", "a") for d in answer[name]]
+
+
+@pytest.mark.parametrize("folder", FORMAT_1, ids=lambda folder: folder.name)
+def test_a_checkpoint_of_format_1_gives_the_answers_that_it_gave(folder, tmp_path):
+    """Made at commit 48cf38f; saved again, it is one of today's."""
+    policy = UniMASKPolicy.from_pretrained(folder)
+    policy.save_pretrained(tmp_path)
+    again = UniMASKPolicy.from_pretrained(tmp_path)
+    for question, expected in json.loads((folder / "answers.json").read_text()).items():
+        for loaded in (policy, again):
+            answer = loaded.infer(None, question, given=expected["given"])
+            for said, before in zip(scores(answer), expected["scores"], strict=True):
+                before = torch.tensor([[float("nan") if v is None else v for v in row] for row in before])
+                torch.testing.assert_close(said, before, equal_nan=True, rtol=1e-5, atol=1e-6)
+
+
+def test_lerobots_own_commands_say_how_to_bring_format_1_up_to_date():
+    with pytest.raises(Exception, match="save_pretrained") as raised:
+        PreTrainedConfig.from_pretrained(FORMAT_1[0])
+    assert "format 1" in str(raised.value)
+
+
+def test_another_kind_of_policy_is_named(tmp_path):
+    (tmp_path / "config.json").write_text('{"type": "act"}')
+    with pytest.raises(ValueError, match="type 'act'"):
+        UniMASKPolicy.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("network.norm.weight", lambda t: t.fill_(float("nan")), "not finite"),
+        ("network.norm.weight", lambda t: t.fill_(float("inf")), "not finite"),
+        ("network.norm.weight", lambda t: t.to(torch.int32), "torch.int32"),
+        ("network.norm.weight", lambda t: t.to(torch.complex64), "torch.complex64"),
+        ("statistics.s_mean", lambda t: t.fill_(float("nan")), "not finite"),
+        ("statistics.a_std", lambda t: t.zero_(), "not positive"),
+        ("statistics.s_std", lambda t: t.fill_(-1), "not positive"),
+        ("statistics.horizon", lambda t: t.zero_(), "not positive"),
+        ("updates", lambda t: t.float(), "torch.float32"),
+    ],
+)
+def test_unsound_weights_do_not_load(tiny_policy, tmp_path, name, change, words):
+    tiny_policy("continuous").save_pretrained(tmp_path)
+    spoil(tmp_path, lambda weights: weights.update({name: change(weights[name])}))
+    with pytest.raises(ValueError, match="are not those of its config") as raised:
+        UniMASKPolicy.from_pretrained(tmp_path)
+    assert name in str(raised.value)
+    assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["width", "depth", "heads", "feedforward_width", "context_length"])
+@pytest.mark.parametrize("value", [10**9, 0, -4])
+def test_an_absurd_size_ends_before_anything_is_allocated(tiny_policy, tmp_path, name, value):
+    tiny_policy("continuous").save_pretrained(tmp_path)
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    with pytest.raises(ValueError, match=f"{name} is {value}"):
+        UniMASKPolicy.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("half_written", ["1000000", "000030"])
+def test_a_run_is_its_last_whole_checkpoint(tiny_policy, tmp_path, half_written):
+    """`last` is followed; without it numbers are compared as numbers, and one without weights does not count."""
+    for updates in ("000020", "100000", "1000001"):
+        tiny_policy().save_pretrained(tmp_path / "checkpoints" / updates / "pretrained_model")
+    broken = tmp_path / "checkpoints" / half_written / "pretrained_model"
+    broken.mkdir(parents=True)
+    (broken / "config.json").write_text('{"type": "unimask"}')
+    assert last_checkpoint(tmp_path).parent.name == "1000001"
+    (tmp_path / "checkpoints" / "last").symlink_to("100000")
+    assert last_checkpoint(tmp_path).parent.name == "100000"

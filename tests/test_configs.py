@@ -84,10 +84,10 @@ def test_its_masks_fit_its_window(path: Path, monkeypatch: pytest.MonkeyPatch, t
 
 @pytest.mark.parametrize("path", GRIDS, ids=str)
 def test_a_grid_opens_with_its_command_which_reads_it(path: Path) -> None:
-    (command,) = (line for line in opening(path) if line.startswith("uv run unimask "))
+    (command,) = (line for line in opening(path) if line.startswith("uv run unimask paper "))
     arguments = make_parser().parse_args(shlex.split(command)[3:])
     assert arguments.config_path == path
-    config = read_config(GRID_OF[arguments.command], ROOT / path)
+    config = read_config(GRID_OF[arguments.part], ROOT / path)
     assert config.name == path.stem
     variants = getattr(config, "variants", {"all": {}})
     drawn = [nested(settings) for settings in draw(getattr(config, "space", {}), getattr(config, "draws", 1))]

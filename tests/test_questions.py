@@ -30,7 +30,7 @@ def exact():
     optimum = Optimum("paper")
 
     def predict(window, mask, cache=None):
-        return {name: [part.float() for part in parts] for name, parts in optimum(window, mask).items()}
+        return {name: [part.float() for part in parts] for name, parts in optimum.predict(window, mask).items()}
 
     policy.predict = predict
     return policy
@@ -43,7 +43,7 @@ def outcomes():
 
 @pytest.fixture(scope="module")
 def imitation(exact):
-    return questions.play(exact, START_PAIRS.repeat(40, axis=0), questions.IMITATION, {}, seed=0)
+    return questions.rollout(exact, START_PAIRS.repeat(40, axis=0), questions.IMITATION, {}, seed=0)
 
 
 def test_the_experts_outcomes_are_those_of_its_rollouts(outcomes):
@@ -123,7 +123,7 @@ def test_every_measurement_is_in_the_record(doorkey_root, tmp_path, monkeypatch,
     flags = [f"--policy.path={tmp_path / 'policy'}", f"--dataset.root={doorkey_root}", "--each=1", "--samples=30"]
     cli.main(["paper", "questions", *flags, f"--output={output}"])
     said, record = capsys.readouterr().out, json.loads(output.read_text())
-    assert record["command"].startswith("unimask questions --policy.path=")
+    assert record["command"].startswith("unimask paper questions --policy.path=")
     assert record.keys() >= {"goals", "returns", "visits", "backward", "orders", "consistency", "versions", "training"}
     assert record["consistency"]["masks"] == 30
     assert record["consistency"]["shown_values_changed"] == 0

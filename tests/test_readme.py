@@ -42,7 +42,7 @@ HOURS = re.compile(r"#.*\bhours\b")
 SMALL = {"policy.width": 16, "policy.depth": 1, "policy.heads": 2, "policy.feedforward_width": 16}
 # Console script -> its flags: (flag, value, when): `always`, or `smaller` where the README itself gives a larger value.
 SHORT: dict[str, list[tuple[str, int, str]]] = {
-    "unimask": [("episodes", 40, "smaller"), ("last_episodes", 40, "smaller")],
+    "unimask": [(name, 40, "smaller") for name in ("episodes", "last_episodes", "dataset.episodes")],
     "lerobot-train": [
         ("steps", 4, "always"),
         ("batch_size", 8, "always"),

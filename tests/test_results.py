@@ -13,7 +13,7 @@ from lerobot_unimask.paper import ablation, heatmap, table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
-PAGES = (ROOT / "README.md").read_text() + (ROOT / "docs" / "results.md").read_text()
+PAGES = "".join(path.read_text() for path in (ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))))
 
 
 def record(name: str) -> dict:

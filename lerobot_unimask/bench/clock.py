@@ -25,7 +25,7 @@ def alone(label: str, measure: Callable[..., dict[str, Any]], *arguments: Any, *
     """What a function of this module returns in a process of its own, with that process's seconds and peak memory."""
     print(f"{label} ...", file=sys.stderr, flush=True)
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([measure.__module__])
+    context.set_forkserver_preload(["lerobot_policy_unimask", measure.__module__])
     with ProcessPoolExecutor(1, mp_context=context) as process:
         return process.submit(_measured, functools.partial(measure, *arguments, **keywords)).result()
 
