@@ -5,7 +5,7 @@ import io
 import logging
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_state
+from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_state, plan_from
 from lerobot_unimask.asking.answers import Answer, answer
 from lerobot_unimask.asking.given import Given
 from lerobot_unimask.asking.memory import RolloutMemory
@@ -291,10 +291,23 @@ class UniMASKPolicy(PreTrainedPolicy):
         with _evaluation(self):
             return act(self, self._memory, state, so_far, **question)
 
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """A chunk of one action, (B, 1, D): `select_action`, which counts as the step's action; the question is asked
-        anew at every step."""
-        return self.select_action(batch, **kwargs).unsqueeze(1)
+    @torch.no_grad()
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Tensor],
+        inference_delay: int = 0,
+        prev_chunk_left_over: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """A chunk for this observation, (B, H, D). Nothing is remembered, so that a server or a thread may call it at
+        any time; for arguments see `asking.acting.plan_from`."""
+        state = observed_state(self, batch)
+        with _evaluation(self):
+            return plan_from(self, state, inference_delay=inference_delay, left_over=prev_chunk_left_over, **kwargs)
+
+    def supports_rtc(self) -> bool:
+        """Whether LeRobot may act by real-time chunking: there is more than one action to a chunk."""
+        return self.config.chunk_size > 1
 
     # --- Checkpoints -------------------------------------------------------------------------------------------------
 
@@ -369,44 +382,19 @@ class UniMASKPolicy(PreTrainedPolicy):
             super().push_model_to_hub(cfg, peft_model, state_dict, dataset_meta)
             return
         name = Path(sys.argv[0]).name
+        command = shlex.join([name, *sys.argv[1:]]) if name == "lerobot-train" else None
         with TemporaryDirectory() as folder:
             self.save_pretrained(folder, state_dict=state_dict)
             cfg.save_pretrained(folder)
-            url = self.push_folder(
-                Path(folder),
-                self.config.repo_id,
-                private=self.config.private,
-                command=shlex.join([name, *sys.argv[1:]]) if name == "lerobot-train" else None,
-                saved=Path(cfg.output_dir),
-            )
+            card = cards.policy_card(self.card_facts(Path(folder), command), self.config.repo_id)
+            saved = Path(cfg.output_dir)
+            url = hub.push_policy(Path(folder), self.config.repo_id, card, private=self.config.private, saved=saved)
         logging.info("Model pushed to %s", url)  # LeRobot's remote jobs watch for these words
 
-    def push_folder(
-        self,
-        folder: Path,
-        repo_id: str,
-        *,
-        private: bool | None = None,
-        command: str | None = None,
-        results: Sequence[Mapping[str, Any]] = (),
-        saved: Path | None = None,
-    ) -> str:
-        """Push a folder that this policy is saved in, with its card, in one commit.
-
-        Args:
-            private: whether to create the repository as a private one.
-            command: training command; without one the card has the train config's.
-            results: records for the card, see `cards.policy_card`.
-            saved: folder where the user finds it, if `folder` is a passing one.
-
-        Returns:
-            The repository's address.
-
-        Raises:
-            HubError: it could not be pushed. Nothing of it is to be seen on the Hub then.
-        """
+    def card_facts(self, folder: Path, command: str | None = None) -> cards.PolicyFacts:
+        """What a card says of this policy, which is saved in `folder`; `command` is what trained it."""
         train_config = folder / "train_config.json"
-        facts = cards.PolicyFacts(
+        return cards.PolicyFacts(
             config=self.config,
             weights=self.training_masks.weights,
             parameters=sum(parameter.numel() for parameter in self.network.parameters()),
@@ -414,8 +402,6 @@ class UniMASKPolicy(PreTrainedPolicy):
             train_config=read_json(train_config) if train_config.exists() else None,
             command=command,
         )
-        card = cards.policy_card(facts, repo_id, results)
-        return hub.push_policy(folder, repo_id, card, private=private, saved=saved)
 
     @classmethod
     def _load_as_safetensor(

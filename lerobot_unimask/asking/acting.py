@@ -70,6 +70,55 @@ def act(
     return as_action(model, action)
 
 
+def plan_from(
+    model: ActingModel,
+    state: Tensor,
+    *,
+    inference_delay: int = 0,
+    left_over: Tensor | None = None,
+    **question: Any,
+) -> Tensor:
+    """A chunk of actions for the observation that is handed over, at position 0; nothing is remembered.
+
+    Actions that are on their way while this is worked out are shown, and the rest are asked given them: real-time
+    chunking as a mask, for which others condition on action prefixes in training (Black et al., "Training-Time Action
+    Conditioning for Efficient Real-Time Chunking", 2025).
+
+    Args:
+        state: (B, D) of the present step.
+        inference_delay: number of actions of `left_over` that will be done by the time the chunk is there.
+        left_over: (T, D) actions of the chunk before that are still to be carried out, the next one first; rows of
+            zeros at its end are LeRobot's padding and do not count.
+        question: `mask`, `given`, `sample` and `generator`, as `UniMASKPolicy.select_action` takes them.
+
+    Returns:
+        (B, H, D) in the dataset's units; its first actions are those of `left_over` that are on their way.
+
+    Raises:
+        ValueError: `left_over` is not (T, D), or the delay is negative.
+    """
+    memory = new_memory(model, len(state))
+    memory.observe(state, torch.zeros(len(state), device=model.device))
+    prefix = _on_their_way(model, inference_delay, left_over)
+    return as_action(model, plan(model, memory, prefix=prefix, **question))
+
+
+def _on_their_way(model: ActingModel, inference_delay: int, left_over: Tensor | None) -> Tensor | None:
+    """(1, d, D) of the actions that will have been carried out, d at most the delay and the chunk."""
+    if inference_delay < 0:
+        raise ValueError(f"inference_delay is {inference_delay}; it counts steps, from 0 on.")
+    if left_over is None:
+        return None
+    size = model.factors["a"].size
+    if left_over.ndim != 2 or left_over.shape[1] != size:
+        raise ValueError(
+            f"prev_chunk_left_over has shape {tuple(left_over.shape)}; actions of this policy are (T, {size})."
+        )
+    done = left_over.ne(0).any(1).nonzero()  # rows that are not padding
+    actions = left_over[: int(done[-1]) + 1 if len(done) else 0]
+    return actions[: min(inference_delay, model.config.chunk_size)].unsqueeze(0).to(model.device, torch.float32)
+
+
 def plan(
     model: ActingModel,
     memory: RolloutMemory,
@@ -98,7 +147,8 @@ def plan(
     if "rtg" in model.factors and table.shows["rtg"][0]:
         target = here.get(("rtg", 0), target_return(model, memory))
         if target is not None:
-            if memory.step == 0 and horizon > memory.last_position + 1 and memory.return_so_far[:, 0].isnan().any():
+            slides = horizon > memory.last_position + 1
+            if memory.step == 0 and slides and memory.return_so_far[:, 0].isnan().any():  # say so at once
                 raise ValueError(NO_RETURN_SO_FAR)
             here["rtg", 0] = memory.remaining(target.to(model.device))
     window, known = give(memory.window(model.statistics.horizon), here, memory.known())

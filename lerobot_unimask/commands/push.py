@@ -40,11 +40,12 @@ def _run(arguments: argparse.Namespace) -> None:
     else:
         from lerobot_unimask.data.checkpoints import last_checkpoint
         from lerobot_unimask.modeling_unimask import UniMASKPolicy
+        from lerobot_unimask.sharing import cards, hub
 
         folder = last_checkpoint(arguments.policy)
         results = [json.loads(path.read_text()) for path in arguments.results]
-        policy = UniMASKPolicy.from_pretrained(folder)
-        url = policy.push_folder(folder, arguments.repo_id, private=arguments.private, results=results)
+        card = cards.policy_card(UniMASKPolicy.from_pretrained(folder).card_facts(folder), arguments.repo_id, results)
+        url = hub.push_policy(folder, arguments.repo_id, card, private=arguments.private)
     print(f"pushed to {url}")
 
 
