@@ -38,7 +38,7 @@ def main(argv: list[str] | None = None) -> None:
         arguments.run(arguments)
     except KeyboardInterrupt:
         sys.exit("unimask: interrupted")
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, OSError, ImportError) as error:
         message = error.args[0] if isinstance(error, KeyError) and error.args else error
         print(f"unimask: error: {message}", file=sys.stderr)
         sys.exit(2)

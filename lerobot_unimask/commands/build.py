@@ -27,6 +27,16 @@ def add(commands: Any) -> None:
     maze2d.add_argument("--maze", default="medium", help="umaze, medium, large, or a maze's own text")
     maze2d.set_defaults(run=_build, settings=("noise", "maze"))
 
+    metaworld = add_command(
+        environments, "metaworld", "a task of MetaWorld for a Sawyer arm, a scripted expert (extra)"
+    )
+    _dataset(metaworld, episodes=100)
+    metaworld.add_argument("--task", required=True, metavar="NAME", help="as in peg-insert-side-v3")
+    metaworld.add_argument(
+        "--noise", type=float, default=0.1, help="standard deviation of the noise on half of the steps"
+    )
+    metaworld.set_defaults(run=_build, settings=("task", "noise"))
+
 
 def _dataset(parser: argparse.ArgumentParser, *, episodes: int) -> None:
     parser.add_argument("--episodes", type=positive, default=episodes, help="default: %(default)s")
@@ -42,8 +52,10 @@ def _build(arguments: argparse.Namespace) -> None:
         raise ValueError("--push_to_hub=true needs the repository's name: --repo_id=ME/NAME.")
     from dataset_builders.doorkey import build_doorkey
     from dataset_builders.maze2d import build_maze2d
+    from dataset_builders.metaworld import build_metaworld
 
-    build = {"doorkey": build_doorkey, "maze2d": build_maze2d}[arguments.environment]
+    builders = {"doorkey": build_doorkey, "maze2d": build_maze2d, "metaworld": build_metaworld}
+    build = builders[arguments.environment]
     settings = {name: getattr(arguments, name) for name in ("episodes", "seed", "repo_id", *arguments.settings)}
     root = build(arguments.root, **settings)
     print(f"{arguments.episodes} episodes in {root}")

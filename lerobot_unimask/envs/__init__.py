@@ -9,23 +9,32 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register
 
-from lerobot_unimask.envs.configs import DoorKeyEnvConfig, Maze2DEnvConfig
+from lerobot_unimask.envs.configs import DoorKeyEnvConfig, Maze2DEnvConfig, MetaWorldEnvConfig
 
 if TYPE_CHECKING:
     from lerobot_unimask.envs.record import Environment
 
-__all__ = ["DoorKeyEnvConfig", "Maze2DEnvConfig", "environment_of_data", "environment_of_states", "environments"]
+__all__ = [
+    "DoorKeyEnvConfig",
+    "Maze2DEnvConfig",
+    "MetaWorldEnvConfig",
+    "environment_of_data",
+    "environment_of_states",
+    "environments",
+]
 
 register(id="lerobot_unimask/DoorKey-v0", entry_point="lerobot_unimask.envs.doorkey.environment:DoorKeyEnv")
 register(id="lerobot_unimask/Maze2D-v0", entry_point="lerobot_unimask.envs.maze2d.environment:Maze2DEnv")
+register(id="lerobot_unimask/MetaWorld-v0", entry_point="lerobot_unimask.envs.metaworld.environment:MetaWorldEnv")
 
 
 def environments() -> Iterator["Environment"]:
     """The record of each environment."""
     from lerobot_unimask.envs.doorkey.record import DOORKEY
     from lerobot_unimask.envs.maze2d.record import MAZE2D
+    from lerobot_unimask.envs.metaworld.record import METAWORLD
 
-    yield from (DOORKEY, MAZE2D)
+    yield from (DOORKEY, MAZE2D, METAWORLD)
 
 
 def environment_of_states(names: Sequence[str]) -> "Environment | None":

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 
 def state_and_action(state: int, action: int) -> dict[str, PolicyFeature]:
@@ -76,3 +76,34 @@ class Maze2DEnvConfig(UniMASKEnvConfig):
     @property
     def gym_kwargs(self) -> Mapping[str, Any]:
         return {**super().gym_kwargs, "maze": self.maze}
+
+
+@EnvConfig.register_subclass("metaworld_state")
+@dataclass
+class MetaWorldEnvConfig(UniMASKEnvConfig):
+    """`--env.type=metaworld_state`: MetaWorld observed by numbers; LeRobot's own `metaworld` shows pictures."""
+
+    task: str | None = "peg-insert-side-v3"
+    """Name of the task."""
+    fps: int = 80
+    """Steps a second."""
+    objects: int | None = None
+    """Number of objects that the observation tells of, one or two; None: as many as the task has."""
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(4,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(4,)),
+            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(10,)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+    )
+
+    @property
+    def gym_id(self) -> str:
+        return "lerobot_unimask/MetaWorld-v0"
+
+    @property
+    def gym_kwargs(self) -> Mapping[str, Any]:
+        return {**super().gym_kwargs, "task": self.task, "objects": self.objects}
