@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,20 @@ from lerobot.utils.random_utils import set_seed
 
 
 def rollout(
-    checkpoint: Path, env_type: str, episodes: int, *, batch_size: int, seed: int, **settings: Any
+    checkpoint: Path,
+    env_type: str,
+    episodes: int,
+    *,
+    batch_size: int,
+    seed: int,
+    environment: Mapping[str, Any] | None = None,
+    **settings: Any,
 ) -> dict[str, Any]:
     """What lerobot-eval does with one checkpoint, videos apart.
 
     Args:
-        settings: of the policy, in place of the checkpoint's, as `--policy.NAME=...`.
+        environment: settings of the environment, as `--env.NAME=...`.
+        settings: settings of the policy, in place of the checkpoint's, as `--policy.NAME=...`.
 
     Returns:
         mean return, its standard error, the share of successes, and the seconds that it took.
@@ -30,7 +39,7 @@ def rollout(
     config.pretrained_path = checkpoint
     for name, value in settings.items():
         setattr(config, name, value)
-    env_config = make_env_config(env_type)
+    env_config = make_env_config(env_type, **(environment or {}))
     envs = make_env(env_config, n_envs=batch_size)
     policy = make_policy(config, env_cfg=env_config)
     preprocessor, postprocessor = make_pre_post_processors(config, pretrained_path=str(checkpoint))

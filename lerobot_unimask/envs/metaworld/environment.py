@@ -22,8 +22,8 @@ EXTRA = "MetaWorld is an extra: pip install 'lerobot_policy_unimask[metaworld]'.
 def load_metaworld() -> Any:
     """The package `metaworld`, mended for MuJoCo 4.
 
-    Note: metaworld 3.0.0 writes 11 numbers to a weld constraint's data, of which MuJoCo 4 has 12. The first 11 mean what
-        they did; here the twelfth stays as the model has it.
+    Note: metaworld 3.0.0 writes 11 numbers to a weld constraint's data, of which MuJoCo 4 has 12. The first 11 mean
+        what they did; here the twelfth stays as the model has it.
 
     Raises:
         ImportError: it is not installed.
