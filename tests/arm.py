@@ -1,4 +1,4 @@
-"""How much acting should remember on MetaWorld's arm: success by `n_obs_steps`, sliding and forgetting, without training anew.
+"""How much acting should remember on MetaWorld's arm: success by `n_obs_steps`, sliding and forgetting.
 
     OMP_NUM_THREADS=1 uv run python tests/arm.py --policy=RUN --task=peg-insert-side-v3 --output=docs/results/FILE.json
 
@@ -73,7 +73,7 @@ def main() -> None:
     write_json(
         arguments.output,
         {
-            "what": "share of successful episodes from unseen starts, most likely actions, by how much acting remembers",
+            "what": "share of successful episodes from unseen starts, most likely actions, by what acting remembers",
             "command": settings,
             "updates": int(policy.updates),
             "policy": {name: getattr(policy.config, name) for name in kept},
