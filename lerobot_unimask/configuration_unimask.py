@@ -41,7 +41,8 @@ NETWORKS = {
 }
 TOKEN_LAYOUTS = ("stacked", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
-MAX_SIZE = 65536  # of a layer: more is a damaged file, or a slip
+# More is a damaged file, or a slip
+MOST = {"width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
 
 
 class FormatVersion(int):
@@ -217,9 +218,9 @@ class UniMASKConfig(PreTrainedConfig):
                 f"causal_share is {self.causal_share}; it must lie between 0 and 1. For none or all use "
                 "attention=bidirectional or causal."
             )
-        for name in ("width", "depth", "heads", "feedforward_width"):
-            if not 1 <= getattr(self, name) <= MAX_SIZE:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1 to {MAX_SIZE}.")
+        for name, most in MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1 to {most}.")
         if self.width % self.heads:
             raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
         if not 0 <= self.dropout < 1:

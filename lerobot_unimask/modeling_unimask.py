@@ -17,17 +17,17 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_state, plan_from
+from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_return, observed_state, plan_from
 from lerobot_unimask.asking.answers import Answer, answer
 from lerobot_unimask.asking.given import Given
 from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
-from lerobot_unimask.data.checkpoints import check_weights, last_checkpoint, read_weights
-from lerobot_unimask.data.factors import RETURN_SO_FAR, RETURN_TO_GO, make_factors
+from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, last_checkpoint, read_weights
+from lerobot_unimask.data.factors import RETURN_TO_GO, make_factors
 from lerobot_unimask.data.returns import EpisodeStarts, read_starts
-from lerobot_unimask.data.window import Statistics, Window, make_window
+from lerobot_unimask.data.window import Statistics, Window, frame_index, make_window, read_batch
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
@@ -123,7 +123,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """
         window = self.make_window(batch)
         step = self.updates if self.training else VALIDATION_STEP
-        mask = self.training_masks(window.valid, _index(batch, window), seed=self.config.mask_seed, step=step)
+        mask = self.training_masks(window.valid, frame_index(batch, window), seed=self.config.mask_seed, step=step)
         window = self.statistics.normalise(window)
         predictions = self.network(window, mask.shown, mask.causal)
         losses = masked_losses(predictions, window, mask.asked, self.factors)
@@ -178,7 +178,7 @@ class UniMASKPolicy(PreTrainedPolicy):
     def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
         """A LeRobot batch as a window of this model, in the dataset's units; see `data.window.make_window`."""
         return make_window(
-            {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)},
+            read_batch(batch, self.config.features, self.device),
             self.config.features,
             self.config.context_length,
             horizon=self.statistics.horizon,
@@ -284,9 +284,9 @@ class UniMASKPolicy(PreTrainedPolicy):
             ValueError: the mask shows a later token that nobody gives, or not one that is given; a value is not legal.
         """
         state = observed_state(self, batch)
+        so_far = observed_return(self, batch, len(state))
         if self._memory is None or len(self._memory.valid) != len(state):
             self._memory = new_memory(self, len(state))
-        so_far = batch.get(RETURN_SO_FAR)
         question = {"mask": mask, "given": given, "sample": sample, "generator": generator}
         with _evaluation(self):
             return act(self, self._memory, state, so_far, **question)
@@ -346,6 +346,10 @@ class UniMASKPolicy(PreTrainedPolicy):
             download = {name: kwargs.pop(name) for name in names if name in kwargs}
             folder = hub.fetch(source, revision=revision, **download)
         config = config or read_config(folder)
+        config.validate_features()
+        with torch.device("meta"):
+            network = make_network(config, make_factors(config.features, gaussian=config.continuous_head == "gaussian"))
+        check_header(folder / WEIGHTS, network.state_dict(prefix="network."))
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)
         policy._read_dataset(dataset_stats, dataset_meta)
@@ -427,10 +431,3 @@ def _evaluation(policy: UniMASKPolicy) -> Iterator[None]:
     finally:
         if was_training:
             policy.train()
-
-
-def _index(batch: Mapping[str, Tensor], window: Window) -> Tensor:
-    """(B,) the frame that each window starts at; a batch that no dataset made is numbered from 0."""
-    if "index" in batch:
-        return batch["index"].reshape(-1).to(window.valid.device)
-    return torch.arange(len(window.valid), device=window.valid.device)

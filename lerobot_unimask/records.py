@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -42,6 +43,10 @@ def read_json(path: Path) -> Any:
 
 
 def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table in Markdown; None is an empty cell."""
+    """A table in Markdown; None is an empty cell, and a bar inside a cell does not end it."""
+
+    def text(cell: Any) -> str:
+        return "" if cell is None else re.sub(r"(?<!\\)\|", r"\\|", str(cell))
+
     lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join('' if cell is None else str(cell) for cell in line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(map(text, line))} |" for line in lines)

@@ -1,7 +1,7 @@
 """Policies and datasets by way of a Hub on the loopback, with the real client and the real commands.
 
 huggingface_hub reads HF_ENDPOINT when it is imported, so `test_hub.py` runs this file in a process of its own. The
-tests build on each other, from top to bottom. To run them alone: `pytest tests/hub_flow.py`.
+tests build on each other, from top to bottom. To run them alone: `pytest --noconftest tests/hub_flow.py`.
 """
 
 import atexit
@@ -47,8 +47,12 @@ import yaml  # noqa: E402
 from huggingface_hub import constants  # noqa: E402
 from lerobot.scripts import lerobot_eval, lerobot_train  # noqa: E402
 
+import lerobot_policy_unimask  # noqa: E402, F401
 from lerobot_unimask import UniMASKPolicy, cli  # noqa: E402
+from lerobot_unimask.sharing import cards, hub  # noqa: E402
 from lerobot_unimask.sharing.hub import HubError  # noqa: E402
+
+torch.set_num_threads(1)
 
 SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
 TRAIN = ["--batch_size=8", "--num_workers=0", "--policy.device=cpu"]
@@ -204,12 +208,9 @@ def answers(policy: UniMASKPolicy) -> list[torch.Tensor]:
     drawn = policy.sample(None, "s[1:9], a[:] | s[0], s[-1]", given=given, samples=3, seed=1).values
     policy.reset()
     states = torch.tensor([[0.0, 5.0], [5.0, 0.0], [1.0, 8.0]])
-    batch = {"observation.state": states, "observation.return_so_far": torch.zeros(3, 1)}
-    acted = [
-        policy.select_action(batch),
-        policy.config.target_return_scale * policy.episode_starts.nearest_return(states),
-    ]
-    return [*(part.probabilities for part in marginals), *drawn.values(), *acted]
+    acted = policy.select_action({"observation.state": states, "observation.return_so_far": torch.zeros(3, 1)})
+    wanted = policy.episode_starts.nearest_return(states)
+    return [*(part.probabilities for part in marginals), *drawn.values(), acted, wanted]
 
 
 def test_a_pulled_policy_gives_the_same_answers_bit_for_bit(checkpoint: Path) -> None:
@@ -390,17 +391,13 @@ def test_of_two_pushes_at_once_one_is_there_and_the_other_is_told(checkpoint: Pa
         policy.updates.fill_(100 + number)
         policy.save_pretrained(HOME / f"both_{number}")
         policies.append((policy, HOME / f"both_{number}"))
-    from lerobot_unimask.sharing import cards, hub
-
-    def push_policy(policy: UniMASKPolicy, folder: Path, repo_id: str) -> None:
-        hub.push_policy(folder, repo_id, cards.policy_card(policy.card_facts(folder), repo_id))
 
     barrier, ended = threading.Barrier(2), [None, None]
 
     def push(number: int) -> None:
         policy, folder = policies[number]
         try:
-            push_policy(policy, folder, "me/both")
+            hub.push_policy(folder, "me/both", cards.policy_card(policy.card_facts(folder), "me/both"))
         except HubError as error:
             ended[number] = error
 
@@ -415,7 +412,8 @@ def test_of_two_pushes_at_once_one_is_there_and_the_other_is_told(checkpoint: Pa
     for winner in (1 - lost, lost):
         pulled = UniMASKPolicy.from_pretrained("me/both")
         assert (pulled.config.mask_seed, int(pulled.updates)) == (100 + winner, 100 + winner)
-        push_policy(*policies[lost], "me/both")  # running it again
+        policy, folder = policies[lost]
+        hub.push_policy(folder, "me/both", cards.policy_card(policy.card_facts(folder), "me/both"))  # again
 
 
 def test_a_dataset_that_could_not_be_pushed_is_pushed_later(refused, unimask) -> None:
@@ -449,7 +447,7 @@ def test_a_push_without_a_name_ends_before_the_work(refused) -> None:
 @pytest.mark.parametrize(
     ("path", "revision", "words"),
     [
-        ("me/nothing", None, "has no model me/nothing that you may read"),
+        ("me/nothing", None, "has no policy me/nothing that you may read"),
         ("outputs/no/folder", None, "neither a folder on this machine nor the name of a repository"),
         ("me/policy", "v9", "me/policy has no revision 'v9'"),
     ],
@@ -465,7 +463,7 @@ def test_a_private_policy_is_its_owner_s_alone(run: Path, monkeypatch) -> None:
         monkeypatch.delenv("HF_TOKEN")
         if token:
             monkeypatch.setenv("HF_TOKEN", token)
-        with pytest.raises(HubError, match="has no model me/copy that you may read"):
+        with pytest.raises(HubError, match="has no policy me/copy that you may read"):
             UniMASKPolicy.from_pretrained("me/copy", cache_dir=HOME / "fresh")
         monkeypatch.setenv("HF_TOKEN", "token-of-me")
     assert int(UniMASKPolicy.from_pretrained("me/copy", cache_dir=HOME / "fresh").updates) == 4

@@ -87,13 +87,15 @@ class Request(NamedTuple):
 
 @dataclass
 class Fault:
-    """What goes wrong with the next `times` requests whose "METHOD /path" matches: one of status, cut, damage, wait."""
+    """What goes wrong with the next `times` requests whose "METHOD /path" matches: one of status, cut, damage, page,
+    wait."""
 
     pattern: str
     times: int
     status: int | None  # answered in place of doing it
     cut: bool  # the connection ends in the middle of the body
     damage: bool  # a byte of the body is another one; its length and all headers are right
+    page: bool  # a page of HTML with status 200, as the login page of a network gives to everybody
     wait: Callable[[], object] | None  # called first; then all goes on as it should
 
 
@@ -146,10 +148,11 @@ class Hub:
         status: int | None = None,
         cut: bool = False,
         damage: bool = False,
+        page: bool = False,
         wait: Callable[[], object] | None = None,
     ) -> Iterator[Fault]:
         """Requests whose "METHOD /path" matches `pattern` fail in this way until the block ends."""
-        fault = Fault(pattern, times, status, cut, damage, wait)
+        fault = Fault(pattern, times, status, cut, damage, page, wait)
         self.faults.append(fault)
         try:
             yield fault
@@ -182,6 +185,8 @@ class _Handler(BaseHTTPRequestHandler):
                 fault.wait()
             if fault and fault.status:
                 raise Reply(fault.status, {"error": "a fault of the test"})
+            if fault and fault.page:
+                raise Reply(200, b"<!doctype html><title>Log in</title>")
             with self.hub.lock:
                 self._route()
             raise Reply(404, {"error": f"this server has no {self.command} {self.address.path}"})

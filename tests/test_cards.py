@@ -2,6 +2,8 @@
 
 import io
 import json
+import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ import yaml
 from PIL import Image
 
 from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask.data.episodes import check_folder
 from lerobot_unimask.envs.doorkey.record import DOORKEY
 from lerobot_unimask.envs.maze2d.record import MAZE2D
 from lerobot_unimask.sharing import cards
@@ -111,6 +114,104 @@ def test_any_other_dataset_has_a_card_too(doorkey_root: Path, tmp_path: Path) ->
     files = cards.dataset_card(tmp_path, "me/other")
     assert set(files) == {"README.md"}
     assert "agent_cell, key_cell" in read(files)[1]
+
+
+HOSTILE = "a\n# no title\n```\n<script>alert(1)</script> | [link](https://evil.example) `code`"
+
+
+def test_nothing_that_a_name_holds_becomes_markdown_or_html(tiny_policy) -> None:
+    """Names, datasets, environments, commands and tasks of a policy's card, each as in a file that somebody made."""
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (2,), "names": [HOSTILE, "plain"]},
+        "action": {"dtype": "float32", "shape": (1,), "names": [HOSTILE]},
+    }
+    stats = {"observation.state": {"mean": [0, 0], "std": [1, 1]}, "action": {"mean": [0], "std": [1]}}
+    policy = tiny_policy("gaussian", features=features, stats=stats)
+    told = {"dataset": {"repo_id": HOSTILE, "root": HOSTILE}, "env": {"type": HOSTILE}}
+    losses = {"mean": {HOSTILE: 1.0}, "validation_episodes": 3, "runs": [1]}
+    check_tame(card(policy, "me/policy", results=[losses], train_config=told, command=f"lerobot-train '{HOSTILE}'"))
+
+
+@pytest.mark.parametrize("field", ["expert", "command", "seed", "beta", "package_version", "names", "dtype", "column"])
+def test_nothing_that_a_dataset_s_files_hold_becomes_markdown_or_html(doorkey_root: Path, tmp_path, field) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(doorkey_root, root)
+    info, provenance = (json.loads((root / "meta" / f"{name}.json").read_text()) for name in ("info", "provenance"))
+    if field in ("names", "dtype", "column"):
+        names, dtype = [HOSTILE] if field == "names" else None, HOSTILE if field == "dtype" else "float32"
+        info["features"][HOSTILE if field == "column" else "extra"] = {"dtype": dtype, "shape": [1], "names": names}
+    else:
+        provenance[field] = HOSTILE
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    (root / "meta" / "provenance.json").write_text(json.dumps(provenance))
+    check_tame(cards.dataset_card(root, "me/doorkey", DOORKEY))
+
+
+def check_tame(files: dict[str, bytes]) -> None:
+    """Outside of code, none of the markup of `HOSTILE`; and no line of it ends a block of code."""
+    body = read(files)[1]
+    assert "alert" in body
+    outside, fence = [], ""
+    for line in body.splitlines():
+        run = re.match("`{3,}", line)
+        if run and not fence:
+            fence = run[0]
+        elif line == fence:
+            fence = ""
+        elif not fence:
+            outside.append(re.sub("`[^`]*`", "", line.replace("\\`", "")))
+    assert not fence
+    text = "\n".join(outside)
+    assert "<script" not in text
+    assert "\n# no title" not in text
+    assert not re.search(r"(?<!\\)\[link(?<!\\)\]", text)
+    tables = [line for line in outside if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in tables} <= {3, 5, 6}
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        *(("fps", value) for value in ("10", None, 0, -1, 1e30, True, [10])),
+        *(("features", value) for value in ([], None, "all", {"a": 1}, {"a": {"dtype": "float32", "shape": "big"}})),
+        *(("features", {"a": {"dtype": 3, "shape": [1]}}) for _ in range(1)),
+        *(("features", {"a": {"dtype": "float32", "shape": [size]}}) for size in (-1, 0, 10**30, "2")),
+        *((name, value) for name in ("total_episodes", "total_frames") for value in ("3", -1, 10**30, None, 1.5)),
+        *(("chunks_size", value) for value in (0, -1, 10**30, "1000")),
+        ("codebase_version", 3),
+        *(
+            ("data_path", value)
+            for value in (
+                "../../secret.parquet",
+                "/etc/passwd",
+                "data/../../x",
+                "data\\..\\..\\x",
+                "data/{chunk_index:9999999999d}.parquet",
+                "{chunk_index.__class__}",
+                "{x}",
+                "{",
+                7,
+            )
+        ),
+        ("video_path", "../{video_key}.mp4"),
+    ],
+)
+def test_an_entry_of_info_json_that_cannot_be_is_named(doorkey_root: Path, tmp_path: Path, entry, value) -> None:
+    (tmp_path / "meta").mkdir()
+    info = json.loads((doorkey_root / "meta" / "info.json").read_text())
+    (tmp_path / "meta" / "info.json").write_text(json.dumps(info | {entry: value}))
+    with pytest.raises(ValueError, match=rf"info.json has {entry}"):
+        cards.dataset_card(tmp_path, "me/other")
+    with pytest.raises(ValueError, match=rf"info.json has {entry}"):
+        check_folder(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", '"x"', "{", "[" * 10_000, "\x00"])
+def test_an_info_json_that_is_no_mapping_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text(text)
+    with pytest.raises(ValueError, match=r"info.json (holds a|cannot be read)"):
+        check_folder(tmp_path)
 
 
 def test_a_card_is_the_same_twice(tiny_policy) -> None:

@@ -1,6 +1,7 @@
 """Checkpoints: saved, loaded, refused, gone on with."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same
 from safetensors.torch import load_file, save_file
 
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
-from lerobot_unimask.data.checkpoints import last_checkpoint
+from lerobot_unimask.data.checkpoints import checkpoints_of, last_checkpoint
 
 
 def test_a_loaded_policy_gives_the_same_answers(kind, layout, tiny_policy, batch_of, tmp_path, states):
@@ -75,6 +76,77 @@ def test_other_weights_are_refused_by_name(tiny_policy, tmp_path, change, messag
     for strict in (True, False):
         with pytest.raises(ValueError, match=message):
             UniMASKPolicy.from_pretrained(tmp_path, strict=strict)
+
+
+def filled(value, *names, dtype=None):
+    """A change of the weights: tensors with a value in their first place, or of another type."""
+
+    def change(weights):
+        for name in names:
+            tensor = weights[name].clone() if dtype is None else weights[name].to(dtype)
+            if value is not None:
+                tensor.view(-1)[0] = value
+            weights[name] = tensor
+
+    return change
+
+
+LAYER, STD = "network.norm.weight", "statistics.a_std"
+UNSOUND = {
+    "NaN": (LAYER, filled(float("nan"), LAYER), "not finite"),
+    "infinity": (LAYER, filled(float("inf"), LAYER), "not finite"),
+    "minus infinity": (LAYER, filled(float("-inf"), LAYER), "not finite"),
+    "too large for float32": (LAYER, filled(1e300, LAYER, dtype=torch.float64), "not finite"),
+    "int32": (LAYER, filled(None, LAYER, dtype=torch.int32), "has type torch.int32 instead of torch.float32"),
+    "bool": (LAYER, filled(None, LAYER, dtype=torch.bool), "has type torch.bool instead of torch.float32"),
+    "complex": (LAYER, filled(None, LAYER, dtype=torch.complex64), "has type torch.complex64"),
+    "fractions of an update": ("updates", filled(None, "updates", dtype=torch.float32), "has type torch.float32"),
+    "negative updates": ("updates", filled(-1, "updates"), "negative"),
+    "a NaN mean": ("statistics.s_mean", filled(float("nan"), "statistics.s_mean"), "not finite"),
+    "a deviation of 0": (STD, filled(0, STD), "not positive"),
+    "a negative deviation": (STD, filled(-1, STD), "not positive"),
+    "a return's deviation of 0": ("statistics.rtg_std", filled(0, "statistics.rtg_std"), "not positive"),
+    "a horizon of 0": ("statistics.horizon", filled(0, "statistics.horizon"), "not positive"),
+    "no frames a second": ("statistics.fps", filled(0, "statistics.fps"), "not positive"),
+}
+
+
+@pytest.mark.parametrize(("name", "change", "words"), UNSOUND.values(), ids=UNSOUND)
+def test_unsound_weights_do_not_load(tiny_policy, tmp_path, name, change, words):
+    tiny_policy("gaussian").save_pretrained(tmp_path)
+    spoil(tmp_path, change)
+    with pytest.raises(ValueError, match=f"{name} .*{words}"):
+        UniMASKPolicy.from_pretrained(tmp_path)
+
+
+@pytest.fixture
+def run(tiny_policy, tmp_path):
+    """A training run of three checkpoints, `last` pointing to the third; the folders' names sort otherwise as text."""
+    for updates in (500000, 900000, 1000000):
+        policy = tiny_policy()
+        policy.updates.fill_(updates)
+        policy.save_pretrained(tmp_path / "checkpoints" / str(updates) / "pretrained_model")
+    (tmp_path / "checkpoints" / "last").symlink_to("1000000")
+    return tmp_path
+
+
+@pytest.mark.parametrize("last", [True, False], ids=["with last", "without last"])
+@pytest.mark.parametrize("file", ["model.safetensors", "config.json"])
+@pytest.mark.parametrize("written", [None, 0, 100], ids=["absent", "empty", "begun"])
+def test_a_checkpoint_that_was_being_written_is_never_taken(run, file, written, last):
+    if file == "config.json" and written is not None and not last:
+        pytest.skip("LeRobot writes the config before the weights")
+    newest = run / "checkpoints" / "1000001" / "pretrained_model"
+    shutil.copytree(run / "checkpoints" / "900000" / "pretrained_model", newest)
+    content = (newest / file).read_bytes()
+    (newest / file).unlink()
+    if written is not None:
+        (newest / file).write_bytes(content[:written])
+    if not last:
+        (run / "checkpoints" / "last").unlink()
+    assert int(UniMASKPolicy.from_pretrained(run).updates) == 1000000
+    if file == "model.safetensors" or written is None:
+        assert checkpoints_of(run)[-1].parent.name == "1000000"
 
 
 def test_every_fault_of_the_weights_is_named_at_once(tiny_policy, tmp_path):
@@ -203,39 +275,6 @@ def test_lerobots_own_commands_say_how_to_bring_format_1_up_to_date():
 def test_another_kind_of_policy_is_named(tmp_path):
     (tmp_path / "config.json").write_text('{"type": "act"}')
     with pytest.raises(ValueError, match="type 'act'"):
-        UniMASKPolicy.from_pretrained(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "words"),
-    [
-        ("network.norm.weight", lambda t: t.fill_(float("nan")), "not finite"),
-        ("network.norm.weight", lambda t: t.fill_(float("inf")), "not finite"),
-        ("network.norm.weight", lambda t: t.to(torch.int32), "torch.int32"),
-        ("network.norm.weight", lambda t: t.to(torch.complex64), "torch.complex64"),
-        ("statistics.s_mean", lambda t: t.fill_(float("nan")), "not finite"),
-        ("statistics.a_std", lambda t: t.zero_(), "not positive"),
-        ("statistics.s_std", lambda t: t.fill_(-1), "not positive"),
-        ("statistics.horizon", lambda t: t.zero_(), "not positive"),
-        ("updates", lambda t: t.float(), "torch.float32"),
-    ],
-)
-def test_unsound_weights_do_not_load(tiny_policy, tmp_path, name, change, words):
-    tiny_policy("continuous").save_pretrained(tmp_path)
-    spoil(tmp_path, lambda weights: weights.update({name: change(weights[name])}))
-    with pytest.raises(ValueError, match="are not those of its config") as raised:
-        UniMASKPolicy.from_pretrained(tmp_path)
-    assert name in str(raised.value)
-    assert words in str(raised.value)
-
-
-@pytest.mark.parametrize("name", ["width", "depth", "heads", "feedforward_width", "context_length"])
-@pytest.mark.parametrize("value", [10**9, 0, -4])
-def test_an_absurd_size_ends_before_anything_is_allocated(tiny_policy, tmp_path, name, value):
-    tiny_policy("continuous").save_pretrained(tmp_path)
-    path = tmp_path / "config.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
-    with pytest.raises(ValueError, match=f"{name} is {value}"):
         UniMASKPolicy.from_pretrained(tmp_path)
 
 

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -18,11 +19,11 @@ FLOW = Path(__file__).with_name("hub_flow.py")
 
 
 def test_everything_by_way_of_a_hub() -> None:
-    """The tests of hub_flow.py, whose huggingface_hub is imported for the loopback server."""
-    flags = ["-q", "--show-capture=no", "-p", "no:cacheprovider", "-p", "no:randomly"]
+    """The tests of hub_flow.py and hub_refusals.py, whose huggingface_hub is imported for the loopback server."""
+    flags = ["-q", "--show-capture=no", "-p", "no:cacheprovider", "-p", "no:randomly", "--noconftest"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "PYTEST_"))}
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *flags, FLOW],
+        [sys.executable, "-m", "pytest", *flags, FLOW, FLOW.with_name("hub_refusals.py")],
         cwd=FLOW.parent.parent,
         env={**environment, "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -82,7 +83,31 @@ WRONG = {
     "an unknown field": ({"learning_speed": 1}, "`learning_speed` are not valid for UniMASKConfig"),
     "a wrong type": ({"width": "wide"}, "`width`: Couldn't parse 'wide' into an int"),
     "a list for a number": ({"context_length": [10]}, "context_length"),
-    "a huge context length": ({"context_length": 10**9}, "context_length is 1000000000; it must lie in 1 to 1024"),
+    **{
+        f"{name} of {size}": ({name: size}, f"{name} is {size}; it must lie in 1 to")
+        for name in ("context_length", "width", "depth", "heads", "feedforward_width", "chunk_size")
+        for size in (10**9, 0, -1, -4)
+    },
+    "a factor's size": (
+        {"features": {"s": [{"key": "observation.state", "size": 10**9}], "a": [{"key": "action", "size": 1}]}},
+        "observation.state has size 1000000000",
+    ),
+    "a factor's negative size": (
+        {"features": {"s": [{"key": "observation.state", "size": -4}], "a": [{"key": "action", "size": 1}]}},
+        "observation.state has size -4",
+    ),
+    **{
+        f"{count} categories": (
+            {
+                "features": {
+                    "s": [{"key": "observation.state", "size": 1, "categories": [count]}],
+                    "a": [{"key": "action", "size": 1}],
+                }
+            },
+            f"observation.state has {count} categories",
+        )
+        for count in (10**9, 0, -1)
+    },
     "a mask that does not parse": ({"training_masks": "a[t] | s[:t+"}, "a[t] | s[:t+"),
     "a mask that is code": ({"inference_mask": CODE}, "__import__"),
     "a list of masks of code": ({"training_masks": [CODE]}, "__import__"),
@@ -105,7 +130,7 @@ def test_a_wrong_config_ends_in_one_error(
 
 @pytest.mark.parametrize(
     "name",
-    ["an unknown field", "a wrong type", "a huge context length", "a mask that does not parse", "a newer format"],
+    ["an unknown field", "a wrong type", "width of 1000000000", "a mask that does not parse", "a newer format"],
 )
 def test_lerobot_eval_refuses_it_too(
     checkpoint: Path, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -123,6 +148,20 @@ def test_lerobot_eval_refuses_it_too(
     while causes[-1].__cause__ is not None:
         causes.append(causes[-1].__cause__)
     assert words in capsys.readouterr().err + "".join(map(str, causes))
+
+
+@pytest.mark.parametrize(
+    "sizes", [{"width": 65536}, {"depth": 512}, {"feedforward_width": 262144}, {"width": 65536, "depth": 100}]
+)
+def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_allocated(
+    checkpoint: Path, sizes: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    change(checkpoint, **sizes)
+    monkeypatch.setattr(UniMASKPolicy, "__init__", None)  # is not even begun
+    began = time.process_time()
+    with pytest.raises(ValueError, match=r"model.safetensors are not those of its config: .* instead of|missing"):
+        UniMASKPolicy.from_pretrained(checkpoint)
+    assert time.process_time() - began < 5
 
 
 def test_weights_cut_short_end_in_one_error(checkpoint: Path) -> None:

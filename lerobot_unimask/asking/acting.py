@@ -23,13 +23,14 @@ from lerobot_unimask.asking.given import (
     give,
     in_window,
     read_given,
+    shown,
 )
 from lerobot_unimask.asking.memory import NO_RETURN_SO_FAR, RolloutMemory
 from lerobot_unimask.asking.sampling import sample as draw_jointly
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.factors import RETURN_SO_FAR, Factor
 from lerobot_unimask.data.returns import EpisodeStarts
-from lerobot_unimask.data.window import Window
+from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask, MaskTable, Token, tabulate
 
@@ -55,13 +56,13 @@ def act(
 
     Args:
         state: (B, D) of the present step, as `observed_state` reads it.
-        return_so_far: (B, 1), rewards received before it, where the environment reports them.
+        return_so_far: (B,) rewards received before it, as `observed_return` reads it.
         question: `mask`, `given`, `sample` and `generator`, as `UniMASKPolicy.select_action` takes them.
 
     Returns:
         (B, D) in the dataset's units.
     """
-    memory.observe(state, None if return_so_far is None else return_so_far.to(model.device).reshape(-1))
+    memory.observe(state, return_so_far)
     if not memory.planned:
         actions = plan(model, memory, **question)
         memory.planned = list(actions[:, : model.config.n_action_steps].unbind(1))
@@ -226,11 +227,13 @@ def observed_state(model: ActingModel, batch: Mapping[str, Tensor]) -> Tensor:
     Raises:
         ValueError: a column is missing, has another shape, or holds a value that is not legal.
     """
+    if not isinstance(batch, Mapping):
+        raise ValueError(f"An observation maps the dataset's columns to tensors; this is a {type(batch).__name__}.")
     parts = []
     for feature in model.config.features["s"]:
         value = batch.get(feature.key)
-        if value is not None and not isinstance(value, Tensor):
-            value = torch.as_tensor(value)
+        if value is not None:
+            value = as_tensor(repr(feature.key), value).float()
         if value is not None and value.ndim == 1 and feature.size == 1:
             value = value.unsqueeze(-1)
         if value is None or value.ndim != 2 or value.shape[-1] != feature.size:
@@ -239,10 +242,27 @@ def observed_state(model: ActingModel, batch: Mapping[str, Tensor]) -> Tensor:
                 f"This policy observes {feature.key!r} with {feature.size} numbers, (batch, {feature.size}); "
                 f"the environment gives {found} under that name."
             )
-        parts.append(value.to(model.device, torch.float32))
+        parts.append(value.to(model.device))
+    if len({len(part) for part in parts}) > 1:
+        raise ValueError(f"The parts of the state are of {', '.join(str(len(part)) for part in parts)} environments.")
     state = torch.cat(parts, dim=-1)
     check_values("The observed state", state, model.factors["s"])
     return state
+
+
+def observed_return(model: ActingModel, batch: Mapping[str, Any], batch_size: int) -> Tensor | None:
+    """(B,) rewards received so far, where the environment reports them.
+
+    Raises:
+        ValueError: they are not one finite number for each environment.
+    """
+    value = batch.get(RETURN_SO_FAR)
+    if value is None:
+        return None
+    received = as_tensor(repr(RETURN_SO_FAR), value).float().reshape(-1)
+    if len(received) != batch_size or not received.isfinite().all():
+        raise ValueError(f"{RETURN_SO_FAR!r} is {shown(value)}; {batch_size} finite numbers are awaited, (B, 1).")
+    return received.to(model.device)
 
 
 def as_action(model: Model, action: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 Legend of shapes: B windows or environments, K steps, D the numbers of a factor.
 """
 
+import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,9 +11,10 @@ import torch
 from torch import Tensor
 
 from lerobot_unimask.data.factors import Factor
-from lerobot_unimask.data.window import Window
+from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.masks import Mask, Token, parse_token
 
+SHORT = reprlib.Repr(maxlist=12, maxdict=6, maxstring=60, maxother=200)
 Given = Mapping[str, Any]  # token text -> its value, shared (D,) or one per environment (B, D); a number where D = 1
 
 
@@ -28,8 +30,12 @@ def read_given(
         MaskError: a key that is not a token.
         ValueError: a value of the wrong size, not finite, or not one of the categories.
     """
+    if not isinstance(given, Mapping):
+        raise ValueError(f'given is {shown(given)}; give values by token, as in {{"s[-1]": [15, 15], "rtg[0]": 5}}.')
     tokens: dict[Token, Tensor] = {}
     for text, value in given.items():
+        if not isinstance(text, str):
+            raise ValueError(f"given names {shown(text)}; name a token by its text, as in 's[-1]'.")
         token = parse_token(text, tuple(factors), context_length)
         if token in tokens:
             raise ValueError(f"{token} is given twice, the second time as {text}.")
@@ -79,21 +85,29 @@ def give(
 def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
     """(B, given_size) or (1, given_size), checked."""
     size = factor.given_size
+    numbers = f"{size} number{'s' * (size > 1)}"
     try:
-        token = torch.as_tensor(value, dtype=torch.float32)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}.") from error
+        token = as_tensor(text, value).float()
+    except ValueError as error:
+        raise ValueError(f"{text} is given {shown(value)}; give {numbers}.") from error
     if token.ndim == 0 or (token.ndim == 1 and size == 1 and token.shape[0] in (B or token.shape[0], 1)):
         token = token.reshape(-1, 1)
     elif token.ndim == 1:
         token = token.unsqueeze(0)
     if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B or token.shape[0]):
         each = "each window or environment" if B is None else f"each of the {B} windows or environments"
-        raise ValueError(
-            f"{text} is given {value!r}; give {size} number{'s' * (size > 1)}, or one such row for {each}."
-        )
-    check_values(f"{text} is given {value!r}, which", token, factor)
+        raise ValueError(f"{text} is given {shown(value)}; give {numbers}, or one such row for {each}.")
+    check_values(f"{text} is given {shown(value)}, which", token, factor)
     return token
+
+
+def shown(value: Any) -> str:
+    """A value of any size in a few words, for an error."""
+    if isinstance(value, Tensor) and (value.is_meta or value.layout != torch.strided):
+        return f"a tensor of {value.dtype}, {value.layout}, on {value.device}"
+    if isinstance(value, int) and abs(value) >= 10**30:
+        return f"a whole number of {value.bit_length()} bits"
+    return SHORT.repr(value)
 
 
 def check_values(what: str, values: Tensor, factor: Factor) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_unimask.asking.answers import Model, answer
+from lerobot_unimask.asking.given import shown
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE, Mask
 
@@ -73,8 +74,7 @@ def sample(
     """
     if order not in ORDERS:
         raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
-    if tries < 1:
-        raise ValueError(f"tries is {tries}; it must be at least 1.")
+    check_count(tries, "tries")
     asked = torch.stack([mask.asked[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
     tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
     if order == "backward":
@@ -137,14 +137,14 @@ def _rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
     return {name: tensor[rows] for name, tensor in tensors.items()}
 
 
-def check_count(samples: int) -> int:
+def check_count(count: int, name: str = "samples") -> int:
     """
     Raises:
-        ValueError: not a number of samples.
+        ValueError: not a whole number of at least 1.
     """
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
-        raise ValueError(f"samples is {samples!r}; draw at least 1.")
-    return samples
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"{name} is {count!r}; give a whole number of at least 1.")
+    return count
 
 
 def make_generator(seed: int, device: torch.device) -> torch.Generator:
@@ -153,5 +153,5 @@ def make_generator(seed: int, device: torch.device) -> torch.Generator:
         ValueError: a seed that torch does not take.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise ValueError(f"seed is {seed!r}; give a whole number from 0 to 2^63 - 1.")
+        raise ValueError(f"seed is {shown(seed)}; give a whole number from 0 to 2^63 - 1.")
     return torch.Generator(device).manual_seed(seed)

@@ -1,10 +1,10 @@
 """Checkpoints of a training run: which there are, and what was saved beside their weights."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -12,6 +12,7 @@ from lerobot_unimask.data.episodes import provenance_of
 from lerobot_unimask.records import read_json
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"  # lerobot's names, in this order of being written
+MAX_FAULTS = 20  # named in one error
 
 
 def checkpoints_of(run: Path) -> list[Path]:
@@ -23,12 +24,24 @@ def checkpoints_of(run: Path) -> list[Path]:
     if (run / CONFIG).exists():
         return [run]
     found = [path.parent for path in run.glob(f"checkpoints/*/pretrained_model/{WEIGHTS}")]
-    found = [path for path in found if path.parent.name.isdecimal() and (path / CONFIG).exists()]
+    found = [path for path in found if path.parent.name.isdecimal() and _is_whole(path)]
     if not found:
         raise FileNotFoundError(
-            f"{run} is neither a checkpoint (a folder with config.json) nor a training run (with checkpoints/)."
+            f"{run} is neither a checkpoint (a folder with config.json) nor a training run with a whole one in "
+            "checkpoints/."
         )
     return sorted(found, key=lambda path: int(path.parent.name))
+
+
+def _is_whole(checkpoint: Path) -> bool:
+    """Whether all that acting needs has been written; of the weights the header is read, which says where they end."""
+    if not (checkpoint / CONFIG).exists():
+        return False
+    try:
+        with safe_open(checkpoint / WEIGHTS, framework="pt"):
+            return True
+    except (SafetensorError, OSError):
+        return False
 
 
 def last_checkpoint(run: Path) -> Path:
@@ -72,6 +85,21 @@ def was_trained_on(checkpoint: str | Path, root: Path, repo_id: str | None) -> b
     return repo_id is not None and data.get("repo_id") == repo_id
 
 
+def check_header(file: Path, expected: Mapping[str, Tensor]) -> None:
+    """Compare the header of a file of weights with tensors of `meta`: nothing of a config's sizes is allocated before
+    the weights are known to have them.
+
+    Raises:
+        ValueError: the file is not one of safetensors, or lacks one of these tensors or has it in another shape.
+    """
+    try:
+        with safe_open(file, framework="pt") as weights:
+            shapes = {name: tuple(weights.get_slice(name).get_shape()) for name in weights.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{file} cannot be read as safetensors: {error}") from error
+    _refuse(_misshapen(shapes, expected), file)
+
+
 def read_weights(file: Path) -> dict[str, Tensor]:
     """
     Raises:
@@ -83,25 +111,38 @@ def read_weights(file: Path) -> dict[str, Tensor]:
         raise ValueError(f"{file} cannot be read as safetensors: {error}") from error
 
 
-def check_weights(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], model_file: str) -> None:
+def check_weights(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], file: str | Path) -> None:
     """
     Raises:
         ValueError: names every tensor that is missing, too many, of another shape or type, or not finite, and every
             standard deviation that is not positive.
     """
-    faults = [f"missing {name}" for name in expected if name not in weights]
+    faults = _misshapen({name: tuple(tensor.shape) for name, tensor in weights.items()}, expected)
     faults += [f"extra {name}" for name in weights if name not in expected]
     for name, tensor in expected.items():
         found = weights.get(name)
-        if found is None:
+        if found is None or found.shape != tensor.shape:
             continue
-        if found.shape != tensor.shape:
-            faults.append(f"{name} has shape {tuple(found.shape)} instead of {tuple(tensor.shape)}")
-        elif found.is_floating_point() != tensor.is_floating_point() or found.is_complex():
+        if found.is_floating_point() != tensor.is_floating_point() or found.is_complex():
             faults.append(f"{name} has type {found.dtype} instead of {tensor.dtype}")
-        elif not found.isfinite().all():
+        elif not found.to(tensor.dtype).isfinite().all():
             faults.append(f"{name} holds numbers that are not finite")
         elif name.startswith("statistics.") and name.endswith(("_std", "horizon", "fps")) and not (found > 0).all():
             faults.append(f"{name} holds numbers that are not positive")
+        elif name == "updates" and found < 0:
+            faults.append("updates is negative")
+    _refuse(faults, file)
+
+
+def _misshapen(shapes: Mapping[str, tuple[int, ...]], expected: Mapping[str, Tensor]) -> list[str]:
+    faults = [f"missing {name}" for name in expected if name not in shapes]
+    for name, tensor in expected.items():
+        if name in shapes and shapes[name] != tensor.shape:
+            faults.append(f"{name} has shape {shapes[name]} instead of {tuple(tensor.shape)}")
+    return faults
+
+
+def _refuse(faults: Sequence[str], file: str | Path) -> None:
     if faults:
-        raise ValueError(f"The weights in {model_file} are not those of its config: {'; '.join(faults)}.")
+        more = f"; and {len(faults) - MAX_FAULTS} more" if len(faults) > MAX_FAULTS else ""
+        raise ValueError(f"The weights in {file} are not those of its config: {'; '.join(faults[:MAX_FAULTS])}{more}.")

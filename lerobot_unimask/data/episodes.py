@@ -3,10 +3,10 @@
 Legend of shapes: B windows, K steps, E episodes.
 """
 
-import json
 import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from string import Formatter
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
@@ -16,6 +16,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from lerobot_unimask.records import read_json
+
+MAX_FPS = 1_000_000
+MAX_COUNT = 10**12  # of episodes, frames, numbers: more is a damaged file
 LOCAL = "local/dataset"  # the name of a dataset that is read from a folder, where nobody gives it one
 
 
@@ -23,9 +27,71 @@ def check_folder(root: Path) -> None:
     """
     Raises:
         FileNotFoundError: there is no dataset in `root`. (LeRobot would ask the Hub for it.)
+        ValueError: its info.json is damaged.
     """
     if not (root / "meta" / "info.json").exists():
         raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
+    read_info(root)
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """A dataset's meta/info.json, its entries of the types and sizes that they can have.
+
+    Raises:
+        ValueError: names the entry that has another, or a path that leads out of the folder.
+    """
+    path = root / "meta" / "info.json"
+    info = read_json(path)
+    if not isinstance(info, dict):
+        raise ValueError(f"{path} holds a {type(info).__name__}; it is a mapping of entries.")
+
+    def refuse(entry: str, value: Any, wanted: str) -> None:
+        raise ValueError(f"{path} has {entry} {str(value)[:80]!r}; it is {wanted}.")
+
+    fps, features = info.get("fps"), info.get("features")
+    if not _is_number(fps) or not 0 < fps <= MAX_FPS:
+        refuse("fps", fps, f"a number above 0, at most {MAX_FPS}")
+    if not isinstance(features, dict):
+        refuse("features", features, "a mapping of columns")
+    for key, feature in features.items():
+        shape = feature.get("shape") if isinstance(feature, dict) else None
+        if not isinstance(shape, list) or not all(_is_count(size, 1, MAX_COUNT) for size in shape):
+            refuse(f"features.{key}", feature, "a mapping with a dtype and a shape, a list of sizes from 1 on")
+        if not isinstance(feature.get("dtype"), str):
+            refuse(f"features.{key}.dtype", feature.get("dtype"), "a text")
+    for entry in ("total_episodes", "total_frames"):
+        if not _is_count(info.get(entry), 0, MAX_COUNT):
+            refuse(entry, info.get(entry), f"a whole number from 0 to {MAX_COUNT}")
+    for entry in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
+        if entry in info and not _is_count(info[entry], 1, MAX_COUNT):
+            refuse(entry, info[entry], f"a whole number from 1 to {MAX_COUNT}")
+    if not isinstance(info.get("codebase_version"), str):
+        refuse("codebase_version", info.get("codebase_version"), "a text, such as v3.0")
+    for entry in ("data_path", "video_path"):
+        if info.get(entry) is not None and not _is_inner_path(info[entry]):
+            refuse(entry, info[entry], "a path inside the folder, of {chunk_index:03d}, {file_index:03d}, {video_key}")
+    return info
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_count(value: Any, least: int, most: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _is_inner_path(text: Any) -> bool:
+    """Whether a pattern of file names stays inside its folder, and has none but LeRobot's fields, short ones."""
+    try:
+        parts = list(Formatter().parse(text))
+    except (TypeError, ValueError):
+        return False
+    fields = {name: form for _, name, form, _ in parts if name is not None}
+    known = {"chunk_index", "file_index", "video_key", "episode_chunk", "episode_index"}
+    plain = all(re.fullmatch(r"(0?\d?d?)?", form or "") for form in fields.values())
+    inner = not PurePosixPath(text).is_absolute() and ".." not in PurePosixPath(text.replace("\\", "/")).parts
+    return fields.keys() <= known and plain and inner and all(part[3] is None for part in parts)
 
 
 def open_dataset(
@@ -105,4 +171,4 @@ def episode_numbers(text: str, count: int) -> list[int]:
 def provenance_of(root: Path) -> dict[str, Any]:
     """How a dataset was built: environment, expert, maze, seed, command, ...; empty where it was not built here."""
     path = root / "meta" / "provenance.json"
-    return json.loads(path.read_text()) if path.exists() else {}
+    return read_json(path) if path.exists() else {}

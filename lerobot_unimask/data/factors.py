@@ -15,6 +15,7 @@ RETURN_TO_GO = "observation.return_to_go"
 RETURN_SO_FAR = "observation.return_so_far"
 TAKEN = (STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are factors already
 
+MAX_SIZE = 65536  # numbers of a column, categories of a number: more is a damaged file
 LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
 
 
@@ -26,6 +27,16 @@ class Feature:
     size: int
     categories: list[int] | None = None  # per dimension; None: continuous
     names: list[str] | None = field(default=None, compare=False)  # per dimension, for people
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.size <= MAX_SIZE:
+            raise ValueError(f"{self.key} has size {self.size}; it must lie in 1 to {MAX_SIZE}.")
+        for what, entries in {"categories": self.categories, "names": self.names}.items():
+            if entries is not None and len(entries) != self.size:
+                raise ValueError(f"{self.key} has {self.size} numbers and {len(entries)} {what}.")
+        for count in self.categories or []:
+            if not 1 <= count <= MAX_SIZE:
+                raise ValueError(f"{self.key} has {count} categories; each number has 1 to {MAX_SIZE}.")
 
 
 @dataclass(frozen=True)
@@ -99,7 +110,7 @@ def _names(feature: Feature) -> tuple[str, ...]:
     return tuple(feature.names or ([plain] if feature.size == 1 else [f"{plain}.{i}" for i in range(feature.size)]))
 
 
-def _flat_names(names: Any) -> list[str]:
+def flat_names(names: Any) -> list[str]:
     """Names as `info.json` has them, some nested one deep: `[["a", "b"]]`, `{"motors": ["a", "b"]}`."""
     if isinstance(names, Mapping):
         names = list(names.values()) if any(isinstance(part, list) for part in names.values()) else list(names)
@@ -116,9 +127,7 @@ def is_numeric(entry: dict[str, Any]) -> bool:
 def read_feature(key: str, entry: dict[str, Any]) -> Feature:
     size = entry["shape"][0] if entry["shape"] else 1
     categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
-    if categories is not None and len(categories) != size:
-        raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
-    names = _flat_names(entry.get("names"))
+    names = flat_names(entry.get("names"))
     return Feature(
         key, size, list(categories) if categories is not None else None, names if len(names) == size else None
     )

@@ -70,9 +70,66 @@ def make_window(
             parts.append(_timestep(batch, parts[0], fps) / horizon)
         values[name] = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
     first = next(iter(values.values()))
+    lengths = {name: len(value) for name, value in values.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"The batch's columns are of different length: {lengths}.")
     pad = batch.get(f"{STATE}_is_pad", batch.get(f"{ACTION}_is_pad"))
-    valid = ~pad if pad is not None else torch.ones(first.shape[:2], dtype=torch.bool, device=first.device)
-    return Window(values, valid)
+    if pad is None:
+        return Window(values, torch.ones(first.shape[:2], dtype=torch.bool, device=first.device))
+    if pad.shape != first.shape[:2] or (pad.dtype != torch.bool and not ((pad == 0) | (pad == 1)).all()):
+        raise ValueError(
+            f"The batch's is_pad is {pad.dtype} of shape {tuple(pad.shape)}; it is True or False, of shape "
+            f"{tuple(first.shape[:2])}."
+        )
+    return Window(values, ~pad.bool())
+
+
+def read_batch(
+    batch: Mapping[str, Any], features: Mapping[str, Sequence[Feature]], device: torch.device
+) -> dict[str, Tensor]:
+    """A batch's columns as tensors on a device. What is none stays out, where the model does not read it.
+
+    Raises:
+        ValueError: a column that the model reads holds no numbers.
+    """
+    if not isinstance(batch, Mapping):
+        raise ValueError(f"A batch maps the dataset's columns to tensors; this is a {type(batch).__name__}.")
+    read = {feature.key for columns in features.values() for feature in columns}
+    read |= {f"{key}_is_pad" for key in read} | {"timestamp", "index"}
+    return {
+        key: as_tensor(repr(key), value, device)
+        for key, value in batch.items()
+        if isinstance(value, Tensor) or key in read
+    }
+
+
+def frame_index(batch: Mapping[str, Tensor], window: Window) -> Tensor:
+    """(B,) the frame that each window starts at; a batch that no dataset made is numbered from 0."""
+    if "index" in batch:
+        index = as_tensor("index", batch["index"], window.valid.device).reshape(-1)
+        if len(index) != len(window.valid):
+            raise ValueError(f"The batch's index numbers {len(index)} windows of {len(window.valid)}.")
+        return index
+    return torch.arange(len(window.valid), device=window.valid.device)
+
+
+def as_tensor(what: str, value: Any, device: torch.device | None = None) -> Tensor:
+    """Numbers of any kind as a tensor.
+
+    Raises:
+        ValueError: it holds none, or is a tensor that is sparse, complex or, on another device than `meta`, without
+            values.
+    """
+    try:
+        tensor = torch.as_tensor(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError, RecursionError) as error:
+        raise ValueError(f"{what} holds no numbers that a tensor can hold: {error}") from error
+    empty = tensor.is_meta and (device is None or device.type != "meta")
+    if tensor.layout != torch.strided or empty or tensor.is_complex():
+        raise ValueError(
+            f"{what} is no plain tensor of numbers but one of {tensor.dtype}, {tensor.layout}, on {tensor.device}."
+        )
+    return tensor if device is None else tensor.to(device)
 
 
 def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:

@@ -3,7 +3,9 @@
 Written from what the policy or the dataset's folder itself holds, without asking any server.
 """
 
+import html
 import io
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,11 +22,12 @@ from lerobot.utils.constants import OBS_STATE
 from matplotlib.figure import Figure
 
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.data.episodes import provenance_of
+from lerobot_unimask.data.episodes import provenance_of, read_info
+from lerobot_unimask.data.factors import flat_names
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS, Mask, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.plots.answers import mask_diagram
-from lerobot_unimask.records import read_json
+from lerobot_unimask.records import markdown_table, read_json
 
 PLUGIN = "lerobot_policy_unimask"
 
@@ -77,7 +80,7 @@ def policy_card(facts: PolicyFacts, repo_id: str, results: Sequence[Mapping[str,
     )
     questions, picture = _questions(facts)
     parts = [
-        f"# {repo_id.split('/')[-1]}",
+        f"# {_plain(repo_id.split('/')[-1])}",
         "A [UniMASK](https://arxiv.org/abs/2211.10869) policy: one masked model that answers any question about "
         "behaviour, as a policy of [LeRobot](https://github.com/huggingface/lerobot). It needs the plugin "
         f"`{PLUGIN}` (version {version(PLUGIN)} has pushed it):",
@@ -140,17 +143,16 @@ def _model(facts: PolicyFacts) -> str:
     rows = []
     for name, features in facts.config.features.items():
         for feature in features:
-            names = ", ".join(feature.names or ["…"] * feature.size)
+            names = _plain(", ".join(feature.names or ["…"] * min(feature.size, 12)))
             values = "continuous"
             if feature.categories:
                 values = " x ".join(map(str, feature.categories)) + " categories"
-            rows.append(f"| `{name}` | `{feature.key}` | {feature.size} | {names} | {values} |")
+            rows.append([_span(name), _span(feature.key), feature.size, names, values])
     config = facts.config
+    table = markdown_table(("factor", "column", "numbers", "names", "values"), rows)
     return (
-        "| factor | column | numbers | names | values |\n| --- | --- | --- | --- | --- |\n"
-        + "\n".join(rows)
-        + f"\n\nContext length: {config.context_length} steps. Attention: {config.attention}. Acting asks "
-        f"`{TASKS.get(config.inference_mask, config.inference_mask)}`. {facts.parameters:,} parameters, "
+        f"{table}\n\nContext length: {config.context_length} steps. Attention: {config.attention}. Acting asks "
+        f"{_span(TASKS.get(config.inference_mask, config.inference_mask))}. {facts.parameters:,} parameters, "
         f"{facts.updates:,} updates."
     )
 
@@ -160,16 +162,16 @@ def _training(facts: PolicyFacts, repo_id: str) -> str:
         return "How it was trained was not saved with it."
     data = facts.train_config["dataset"]
     revision = facts.config.dataset_revision
-    place = f"at revision `{revision}`" if revision else "local: it was read from a folder, which has no revision"
+    place = f"at revision {_span(revision)}" if revision else "local: it was read from a folder, which has no revision"
     again = f"lerobot-train --config_path={repo_id} --policy.push_to_hub=false --output_dir=outputs/again"
-    return f"Data: `{data['repo_id']}`, {place}.\n\n{_code(facts.command or again)}"
+    return f"Data: {_span(data['repo_id'])}, {place}.\n\n{_code(facts.command or again)}"
 
 
 def _commands(facts: PolicyFacts, repo_id: str) -> str:
     """Evaluating, asking, fine-tuning: three commands that work as they stand where the training did."""
     train_config, config = facts.train_config or {}, facts.config
     data = train_config.get("dataset") or {"repo_id": "ME/DATASET"}
-    dataset = f"--dataset.repo_id={data['repo_id']}"
+    dataset = f"--dataset.repo_id={shlex.quote(str(data['repo_id']))}"
     if data.get("root") and not config.dataset_revision:
         dataset += f" --dataset.root={shlex.quote(str(data['root']))}"
     environment = (train_config.get("env") or {}).get("type") or _robot(data.get("root")) or "YOUR_ENVIRONMENT"
@@ -177,7 +179,8 @@ def _commands(facts: PolicyFacts, repo_id: str) -> str:
     _, t = _example(question, tuple(config.features), config.context_length)
     at = "" if t is None else f" --t={t}"
     return (
-        f"lerobot-eval --policy.path={repo_id} --env.type={environment} --eval.n_episodes=100 --eval.batch_size=50\n"
+        f"lerobot-eval --policy.path={repo_id} --env.type={shlex.quote(str(environment))} --eval.n_episodes=100 "
+        "--eval.batch_size=50\n"
         f"unimask query --policy.path={repo_id} {dataset} --episode=0 --mask={shlex.quote(question)}{at}\n"
         f"lerobot-train --policy.path={repo_id} --policy.push_to_hub=false {dataset} "
         "--policy.training_masks=behavior_cloning --policy.optimizer_lr=1e-4 --steps=500 --batch_size=100 "
@@ -195,11 +198,11 @@ def _results(results: Sequence[Mapping[str, Any]]) -> list[str]:
     parts = []
     for record in results:
         if "mean" in record and "validation_episodes" in record:
-            rows = "\n".join(f"| `{task}` | {loss:.3f} |" for task, loss in record["mean"].items())
+            rows = [[_span(task), f"{loss:.3f}"] for task, loss in record["mean"].items()]
             runs = len(record["runs"])
             parts.append(
                 f"Validation loss, in nats per asked token, on {record['validation_episodes']:,} episodes"
-                f"{f', mean of {runs} runs' if runs > 1 else ''}:\n\n| task | loss |\n| --- | --- |\n{rows}"
+                f"{f', mean of {runs} runs' if runs > 1 else ''}:\n\n{markdown_table(('task', 'loss'), rows)}"
             )
         elif "n_episodes" in record.get("overall", {}):
             overall = record["overall"]
@@ -241,7 +244,7 @@ COLUMNS = {
 
 def dataset_card(root: Path, repo_id: str, environment: Described | None = None) -> dict[str, bytes]:
     """A dataset's card: file name -> content; with a picture where it is of an environment of this package."""
-    info = read_json(root / "meta" / "info.json")
+    info = read_info(root)
     provenance = provenance_of(root)
     metadata = DatasetCardData(
         license=LICENSE,
@@ -255,27 +258,31 @@ def dataset_card(root: Path, repo_id: str, environment: Described | None = None)
         "licence": LICENSE,
     }
     if environment:
-        expert = provenance["expert"]
+        expert = str(provenance["expert"])
         settings = ", ".join(f"{name} {provenance[name]}" for name in ("beta", "noise", "maze") if name in provenance)
         facts = {
-            "environment": f"{environment.description} (`--env.type={environment.type}`)",
+            "environment": f"{environment.description} (--env.type={environment.type})",
             "expert": f"{expert}: {environment.expert}" if expert not in environment.expert else environment.expert,
             "settings": f"{settings}, seed {provenance['seed']}",
             "reward": environment.reward,
             **facts,
         }
     meanings = {**COLUMNS, **(environment.columns if environment else {})}
-    columns = "\n".join(
-        f"| `{name}` | {column['dtype']} ({', '.join(map(str, column['shape']))}) | {_categories(column)} | "
-        f"{meanings.get(name) or ', '.join(column.get('names') or [])} |"
+    columns = [
+        [
+            _span(name),
+            f"{_plain(column['dtype'])} ({', '.join(map(str, column['shape']))})",
+            _plain(" x ".join(map(str, column.get("categories") or []))),
+            meanings.get(name) or _plain(", ".join(flat_names(column.get("names")))),
+        ]
         for name, column in info["features"].items()
-    )
+    ]
     parts = [
-        f"# {repo_id.split('/')[-1]}",
+        f"# {_plain(repo_id.split('/')[-1])}",
         "A dataset for [LeRobot](https://github.com/huggingface/lerobot).",
-        "\n".join(f"- {name}: {fact}" for name, fact in facts.items()),
+        "\n".join(f"- {name}: {_plain(fact)}" for name, fact in facts.items()),
         "## Columns",
-        f"| column | type | categories | meaning |\n| --- | --- | --- | --- |\n{columns}",
+        markdown_table(("column", "type", "categories", "meaning"), columns),
         "## Use",
         _code(
             f"{INSTALL}\nlerobot-train --policy.type=unimask --policy.push_to_hub=false --dataset.repo_id={repo_id} "
@@ -283,17 +290,13 @@ def dataset_card(root: Path, repo_id: str, environment: Described | None = None)
         ),
     ]
     if "command" in provenance:
-        parts += [f"Made by {PLUGIN} {provenance['package_version']} with:", _code(provenance["command"])]
+        parts += [f"Made by {PLUGIN} {_plain(provenance['package_version'])} with:", _code(str(provenance["command"]))]
     files = {}
     if environment:
         files["episodes.png"] = _png(_draw_episodes(root, info, provenance, environment))
         parts.insert(3, f"![The first {DRAWN_EPISODES} episodes](episodes.png)")
     text = "\n\n".join([f"---\n{metadata.to_yaml()}\n---", *parts]) + "\n"
     return {"README.md": text.encode(), **files}
-
-
-def _categories(column: Mapping[str, Any]) -> str:
-    return " x ".join(map(str, column.get("categories") or []))
 
 
 def _draw_episodes(
@@ -308,7 +311,20 @@ def _draw_episodes(
 
 
 def _code(text: str, language: str = "bash") -> str:
-    return f"```{language}\n{dedent(text)}\n```"
+    """A block of code, whose fence is longer than any in it."""
+    text = dedent(text)
+    fence = "`" * max(3, *(len(run) + 1 for run in re.findall("`+", text)), 3)
+    return f"{fence}{language}\n{text}\n{fence}"
+
+
+def _plain(text: Any) -> str:
+    """Text from a file as one line that is no Markdown and no HTML."""
+    return re.sub(r"([\\`*\[\]])", r"\\\1", html.escape(" ".join(str(text).split()), quote=False))
+
+
+def _span(text: Any) -> str:
+    """Text from a file as code within a line."""
+    return "`" + " ".join(str(text).split()).replace("`", "'") + "`"
 
 
 def _png(figure: Figure) -> bytes:

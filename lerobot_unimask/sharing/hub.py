@@ -17,6 +17,8 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, co
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from huggingface_hub.errors import (
     EntryNotFoundError,
+    FileMetadataError,
+    GatedRepoError,
     HfHubHTTPError,
     HFValidationError,
     LocalEntryNotFoundError,
@@ -97,31 +99,42 @@ def _check_processors(folder: Path, repo_id: str) -> None:
 
 
 @contextmanager
-def pull_errors(repo_id: str, revision: str | None) -> Iterator[None]:
+def pull_errors(repo_id: str, revision: str | None, kind: str = "policy") -> Iterator[None]:
+    """
+    Args:
+        kind: what is pulled, "policy" or "dataset".
+
+    Raises:
+        HubError: says what was asked for, and what the Hub answered or that it did not.
+    """
     try:
         yield
     except HFValidationError as error:
         raise HubError(
             f"{repo_id!r} is neither a folder on this machine nor the name of a repository on the Hub, ME/NAME."
         ) from error
+    except GatedRepoError as error:
+        page = f"{constants.ENDPOINT}/{'datasets/' if kind == 'dataset' else ''}{repo_id}"
+        raise HubError(f"{repo_id} is gated: its owner has to let you in, at {page}.") from error
     except RepositoryNotFoundError as error:
         raise HubError(
-            f"The Hub at {constants.ENDPOINT} has no model {repo_id} that you may read: check the name and, if it is "
+            f"The Hub at {constants.ENDPOINT} has no {kind} {repo_id} that you may read: check the name and, if it is "
             "private, log in with `hf auth login` or set HF_TOKEN."
         ) from error
     except RevisionNotFoundError as error:
         raise HubError(f"{repo_id} has no revision {revision!r} on the Hub; `main` is its newest.") from error
     except LocalEntryNotFoundError as error:
-        reason = f"the Hub at {constants.ENDPOINT} cannot be reached: try again once it can"
         if constants.is_offline_mode():
-            reason = "HF_HUB_OFFLINE=1 forbids asking the Hub for it: run this once without HF_HUB_OFFLINE"
-        raise HubError(f"The policy {repo_id} has not been pulled to this machine, and {reason}.") from error
+            reason = "HF_HUB_OFFLINE=1 forbids asking the Hub for it: run this once without HF_HUB_OFFLINE."
+        else:
+            reason = _refusal(_answer(error))
+        raise HubError(f"The {kind} {repo_id} has not been pulled to this machine, and {reason}") from error
     except EntryNotFoundError as error:
         raise HubError(
             f"{repo_id} holds no {error}{f' at revision {revision!r}' if revision else ''}: it is not a policy, or its "
             f"first push has not been finished; `unimask push --policy.path=DIR --repo_id={repo_id}` does so."
         ) from error
-    except HfHubHTTPError as error:
+    except (HfHubHTTPError, FileMetadataError, json.JSONDecodeError, httpx.ConnectError) as error:
         raise HubError(f"{repo_id} cannot be pulled: {_refusal(error)}") from error
     except (httpx.HTTPError, OSError) as error:
         raise HubError(
@@ -133,7 +146,8 @@ def pull_errors(repo_id: str, revision: str | None) -> Iterator[None]:
 def pulled_version(repo_id: str, version: Any, **kwargs: Any) -> str:
     """In place of LeRobot's `get_safe_version`: offline, the version that is asked for, if it has been pulled."""
     if not constants.is_offline_mode():
-        return get_safe_version(repo_id, version, **kwargs)
+        with pull_errors(repo_id, str(version), "dataset"):
+            return get_safe_version(repo_id, version, **kwargs)
     place = HF_LEROBOT_HUB_CACHE / repo_folder_name(repo_id=repo_id, repo_type="dataset") / "refs" / str(version)
     if not place.exists():
         raise HubError(
@@ -163,9 +177,12 @@ def push_policy(
         The repository's address.
 
     Raises:
-        HubError: it could not be pushed. Nothing of it is to be seen on the Hub then.
+        HubError: it could not be pushed. Says what of it is to be seen on the Hub then: nothing.
+        ValueError: a file is a link that leads out of the folder.
     """
     files = {path.name: path for pattern in ("*.json", "*.safetensors") for path in sorted(folder.glob(pattern))}
+    # A checkpoint in the client's cache is made of links into the cache's own repository.
+    _check_links(files, folder.parent.parent if commit_of(folder) else folder)
     return _push(
         {**files, **card},
         repo_id,
@@ -188,9 +205,7 @@ def push_dataset(root: Path, repo_id: str, card: Mapping[str, bytes], *, private
     files = {
         path.as_posix(): place for path, place in paths.items() if not any(part.startswith(".") for part in path.parts)
     }
-    astray = [name for name, place in files.items() if not place.resolve().is_relative_to(root.resolve())]
-    if astray:
-        raise ValueError(f"{root / astray[0]} is a link out of the dataset's folder: put the file itself there.")
+    _check_links(files, root)
     return _push(
         {**files, **card},
         repo_id,
@@ -200,6 +215,12 @@ def push_dataset(root: Path, repo_id: str, card: Mapping[str, bytes], *, private
         again=f"unimask push --dataset.root={shlex.quote(str(root))} --repo_id={repo_id}",
         tag=read_json(root / "meta" / "info.json")["codebase_version"],
     )
+
+
+def _check_links(files: Mapping[str, Path], folder: Path) -> None:
+    for path in files.values():
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{path} is a link out of its folder, so it is not pushed: put the file itself there.")
 
 
 def _push(
@@ -214,7 +235,7 @@ def _push(
 ) -> str:
     """Make one commit of all files; with a tag, of these files alone, and let the tag name it."""
     api = HfApi()
-    with _push_errors(repo_id, again):
+    with _push_errors(repo_id, again, "nothing of this push is to be seen there"):
         url = api.create_repo(repo_id, repo_type=kind, private=private, exist_ok=True)
         repo_id = url.repo_id
         # The client leaves out what the head has already, so the commit is whole on this head alone.
@@ -224,7 +245,11 @@ def _push(
             there = api.list_repo_files(repo_id, repo_type=kind, revision=head)
             operations += [CommitOperationDelete(path) for path in there if path not in {*files, ".gitattributes"}]
         commit = api.create_commit(repo_id, operations, commit_message=message, repo_type=kind, parent_commit=head)
-        if tag is not None:
+    if tag is not None:
+        there = (
+            f"its {len(files)} files are there, in commit {commit.oid[:8]}, but not the tag {tag}, which LeRobot reads"
+        )
+        with _push_errors(repo_id, again, there):
             _set_tag(api, repo_id, kind, tag, commit.oid)
     return url.url
 
@@ -239,36 +264,65 @@ def _set_tag(api: HfApi, repo_id: str, kind: str, tag: str, commit: str) -> None
 
 
 @contextmanager
-def _push_errors(repo_id: str, again: str) -> Iterator[None]:
-    nothing = f"nothing of this push is to be seen there. Push it again with:\n  {again}"
+def _push_errors(repo_id: str, again: str, there: str) -> Iterator[None]:
+    """
+    Args:
+        again: command that pushes it again.
+        there: what the Hub holds of it if something goes wrong now.
+    """
     try:
         yield
     except HFValidationError as error:
         raise HubError(f"{repo_id!r} is not a repository's name; names are ME/NAME.") from error
     except OfflineModeIsEnabled as error:
         raise HubError(f"HF_HUB_OFFLINE=1 forbids pushing {repo_id}; without it, push with:\n  {again}") from error
-    except (HfHubHTTPError, httpx.HTTPError, RuntimeError) as error:
+    except (HfHubHTTPError, httpx.HTTPError, json.JSONDecodeError, RuntimeError) as error:
         # The client's uploads report a RuntimeError, with what happened as its cause.
         cause = error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ else error
-        status = cause.response.status_code if isinstance(cause, HfHubHTTPError) else None
-        if status == 401:
-            token = "refuses your token" if get_token() else "wants a token"
-            reason = f"the Hub at {constants.ENDPOINT} {token}: log in with `hf auth login` or set HF_TOKEN"
-        elif status == 403:
-            reason = f"your token may not write there; {repo_id.split('/')[0]} is its owner's name"
-        elif status == 412:
-            reason = "somebody else has pushed there in the meantime"
+        if _status(cause) == 403:
+            reason = f"your token may not write there; {repo_id.split('/')[0]} is its owner's name."
+        elif _status(cause) == 412:
+            reason = "somebody else has pushed there in the meantime."
         else:
-            reason = _refusal(cause).rstrip(".")
-        raise HubError(f"{repo_id} has not been pushed: {reason}; {nothing}") from error
+            reason = _refusal(cause)
+        raise HubError(
+            f"{repo_id} has not been pushed: {reason.rstrip('.')}; {there}. Push it again with:\n  {again}"
+        ) from error
+
+
+def _status(error: BaseException | None) -> int | None:
+    return error.response.status_code if isinstance(error, HfHubHTTPError) else None
+
+
+def _answer(error: BaseException) -> BaseException:
+    """What the Hub answered, among the causes of an error; else the first cause."""
+    while error.__cause__ is not None and _status(error) is None:
+        error = error.__cause__
+    return error
 
 
 def _refusal(error: BaseException) -> str:
-    if isinstance(error, HfHubHTTPError):
-        if error.response.status_code == 401:
-            return f"the Hub at {constants.ENDPOINT} refuses your token: log in with `hf auth login` or set HF_TOKEN."
-        return f"the Hub at {constants.ENDPOINT} answers with status {error.response.status_code}: try again later."
-    return f"the connection to the Hub at {constants.ENDPOINT} failed ({_first_line(error)})."
+    """A sentence about what came back from the Hub, and what to do."""
+    hub, status = f"the Hub at {constants.ENDPOINT}", _status(error)
+    if status == 401:
+        token = "refuses your token" if get_token() else "wants a token"
+        return f"{hub} {token}: log in with `hf auth login` or set HF_TOKEN."
+    if status == 403:
+        return f"{hub} forbids it (status 403): your token does not have the right to."
+    if status == 404:
+        return f"{hub} has nothing at {error.response.url.path} (status 404): check the name, and HF_ENDPOINT."
+    if status == 429:
+        wait = error.response.headers.get("Retry-After", "")
+        return f"{hub} has had too many requests (status 429): try again in {f'{wait} s' if wait else 'a while'}."
+    if status is not None and status >= 500:
+        return f"{hub} has a fault of its own (status {status}): try again later."
+    if status is not None:
+        return f"{hub} answers with status {status}: {_first_line(error)}."
+    if isinstance(error, FileMetadataError | json.JSONDecodeError):
+        return f"what answers at {constants.ENDPOINT} is not a Hub; it may be the login page of this network."
+    if isinstance(error, LocalEntryNotFoundError):
+        return f"{hub} was not asked for it: leave out local_files_only."
+    return f"{hub} cannot be reached ({_first_line(error)}): try again once it can."
 
 
 def _first_line(error: BaseException) -> str:
