@@ -98,3 +98,14 @@ def _work_offline() -> None:
                 raise
 
     PreTrainedConfig.from_pretrained = classmethod(read_or_name)
+
+
+def make_known_to_policy_server() -> None:
+    """LeRobot's policy server refuses policies that are not in a list of its own; `unimask serve` alone calls this.
+
+    Other policies: unchanged.
+    """
+    from lerobot.async_inference.constants import SUPPORTED_POLICIES
+
+    if "unimask" not in SUPPORTED_POLICIES:
+        SUPPORTED_POLICIES.append("unimask")

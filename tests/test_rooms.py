@@ -99,6 +99,7 @@ FLOORS = [
     "lerobot_unimask/commands/given.py",
     "lerobot_unimask/commands/validate.py",
     "lerobot_unimask/commands/measure.py",
+    "lerobot_unimask/commands/serve.py",
     "lerobot_unimask/commands/bench.py",
     "lerobot_unimask/commands/paper.py",
     "lerobot_unimask/cli.py",
