@@ -18,6 +18,7 @@ from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
 from lerobot_unimask.data.factors import (
+    TASK,
     Feature,
     declared_feature,
     describe_features,
@@ -100,9 +101,9 @@ class UniMASKConfig(PreTrainedConfig):
     "auto": that of the training episode whose first state is nearest, times target_return_scale."""
     target_return_scale: float = 1.1
     """Factor of the nearest episode's return, with target_return=auto; the paper asks for a tenth more."""
-    given: dict[str, list[list[float] | float] | float] = field(default_factory=dict)
+    given: dict[str, list[list[float] | float | str] | float | str] = field(default_factory=dict)
     """Values of single tokens in a rollout, in the dataset's units: of a position in the window, {"s[-1]": [15, 15]},
-    or of a step of the episode, {"s@150": [15, 15]}."""
+    of a step of the episode, {"s@150": [15, 15]}, or a task's text, {"task[0]": "open the door"}."""
     sample_actions: bool = False
     """Whether acting draws from the answer instead of taking its most likely action."""
     n_obs_steps: int | None = None
@@ -159,6 +160,9 @@ class UniMASKConfig(PreTrainedConfig):
     """Updates in which the learning rate rises; then it falls along a cosine."""
 
     # The data
+    states: list[str] | None = None
+    """Columns that make up `s`, such as ["observation.state", "observation.velocity"]; None: observation.state and
+    observation.environment_state, where the dataset has them."""
     properties: list[str] = field(default_factory=list)
     """Columns that label whole episodes, observation.NAME: each is a factor NAME, shown as NAME[0] or not at all."""
 
@@ -276,13 +280,20 @@ class UniMASKConfig(PreTrainedConfig):
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
         """
         found = {key: read_feature(key, entry) for key, entry in dataset_features.items() if is_numeric(entry)}
-        features = group_features(found, self.properties)
+        features = group_features(found, self.properties, self.states)
+        tasks = {name: columns for name, columns in self.features.items() if name == TASK}  # not among the columns
+        features |= tasks
         if self.features and features != self.features:
             raise ValueError(
                 "This checkpoint was trained on other features than the dataset has.\n"
                 f"  checkpoint: {describe_features(self.features)}\n  dataset:    {describe_features(features)}"
             )
         self.features = features
+
+    def add_tasks(self, texts: Sequence[str]) -> None:
+        """Make the task a factor, where the dataset has several."""
+        if len(texts) > 1 and self.network != "decision_transformer":  # which reads no properties
+            self.features[TASK] = [Feature(TASK, 1, [len(texts)], labels=list(texts))]
 
     def validate_features(self) -> None:
         """Where no dataset has said more, take the factors from LeRobot's input and output features, all continuous.
@@ -294,13 +305,14 @@ class UniMASKConfig(PreTrainedConfig):
             declared = {**(self.input_features or {}), **(self.output_features or {})}
             sizes = {key: feature for key, feature in declared.items() if len(feature.shape) <= 1}
             self.features = group_features(
-                {key: declared_feature(key, feature) for key, feature in sizes.items()}, self.properties
+                {key: declared_feature(key, feature) for key, feature in sizes.items()}, self.properties, self.states
             )
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
     """A config.json of format 1 as one of today's format, which answers the same."""
     content = {name: value for name, value in content.items() if name != "causal_draw"}
+    content["n_obs_steps"] = None  # LeRobot's own default, 1, stands in all of them, and nothing read it
     content["state_residuals"] = content.get("fine_inputs", True)
     content["format_version"] = int(FORMAT_VERSION)
     if content.get("network") == "decision_gpt":

@@ -10,11 +10,13 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import dataset_metadata, factory, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
@@ -32,6 +34,7 @@ def apply() -> None:
     _read_windows_in_batches()
     _read_as_this_policy_needs()
     _work_offline()
+    _record_integers()
 
 
 def _read_windows_in_batches() -> None:
@@ -98,6 +101,25 @@ def _work_offline() -> None:
                 raise
 
     PreTrainedConfig.from_pretrained = classmethod(read_or_name)
+
+
+def _record_integers() -> None:
+    """lerobot-eval --eval.recording=true declares all numbers as float32 and then refuses others, such as DoorKey's
+    cells and directions.
+
+    Other policies: numbers are recorded as the type that LeRobot has declared; those that it took are not changed.
+    """
+    build = lerobot_eval._build_raw_frame
+
+    @functools.wraps(build)
+    def build_declared(*arguments: Any) -> dict[str, Any]:
+        features, frame = arguments[-1], build(*arguments)
+        for key, value in frame.items():
+            if isinstance(value, np.ndarray) and features.get(key, {}).get("dtype") == "float32":
+                frame[key] = value.astype(np.float32, copy=False)
+        return frame
+
+    lerobot_eval._build_raw_frame = build_declared
 
 
 def make_known_to_policy_server() -> None:

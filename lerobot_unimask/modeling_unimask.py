@@ -25,9 +25,9 @@ from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, last_checkpoint, read_weights
-from lerobot_unimask.data.factors import RETURN_TO_GO, make_factors
+from lerobot_unimask.data.factors import RETURN_TO_GO, TASK, make_factors
 from lerobot_unimask.data.returns import EpisodeStarts, read_starts
-from lerobot_unimask.data.window import Statistics, Window, frame_index, make_window, read_batch
+from lerobot_unimask.data.window import Statistics, Window, frame_index, make_window, read_batch, task_column
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
@@ -67,6 +67,8 @@ class UniMASKPolicy(PreTrainedPolicy):
     ) -> None:
         super().__init__(config)
         config.validate_features()
+        if dataset_meta is not None and TASK not in config.features:
+            config.add_tasks(list(dataset_meta.tasks.index))
         if config.image_features:
             names = ", ".join(config.image_features)
             logger.warning("unimask ignores the camera features %s; LeRobot decodes them all the same.", names)
@@ -111,24 +113,25 @@ class UniMASKPolicy(PreTrainedPolicy):
 
     # --- Training ----------------------------------------------------------------------------------------------------
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, Mapping[str, float]]:
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, LossParts]:
         """The loss of one batch.
 
         Args:
             batch: `observation.state` (B, K, D), `action` (B, K, D), `observation.return_to_go` (B, K), each with its
                 `*_is_pad` (B, K), `timestamp` (B,) and `index` (B,), as LeRobot's dataset gives them. Not changed.
+            reduction: "mean"; or "none" for each window's part, which lerobot-train weights with --sample_weighting.
 
         Returns:
-            The scalar loss, and each factor's part in it for the log.
+            The scalar loss, or (B,) whose mean it is; and each factor's part in it for the log.
         """
         window = self.make_window(batch)
         step = self.updates if self.training else VALIDATION_STEP
         mask = self.training_masks(window.valid, frame_index(batch, window), seed=self.config.mask_seed, step=step)
         window = self.statistics.normalise(window)
         predictions = self.network(window, mask.shown, mask.causal)
-        losses = masked_losses(predictions, window, mask.asked, self.factors)
+        losses = masked_losses(predictions, window, mask.asked, self.factors, reduction=reduction)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
-        return loss, LossParts({f"loss_{name}": part.detach() for name, part in losses.items()})
+        return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
 
     def train(self, mode: bool = True) -> "UniMASKPolicy":
         """As PyTorch's; on a processor, training begins with glibc told to keep freed memory."""
@@ -139,6 +142,11 @@ class UniMASKPolicy(PreTrainedPolicy):
     def update(self) -> None:
         """Count an update; LeRobot calls this after each optimiser step."""
         self.updates += 1
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """What --peft adapts, of whichever network: its linear layers."""
+        linear = r"query_key_value|project|feedforward\.[02]|hidden\.\d+\.0|numbers|returns|stack|heads\.\w+"
+        return {"target_modules": rf"network\.(.*\.)?({linear})"}
 
     def get_optim_params(self) -> Iterator[torch.nn.Parameter]:
         return self.parameters()
@@ -177,6 +185,8 @@ class UniMASKPolicy(PreTrainedPolicy):
 
     def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
         """A LeRobot batch as a window of this model, in the dataset's units; see `data.window.make_window`."""
+        if TASK in self.factors and TASK in batch:
+            batch = {**batch, TASK: task_column(batch[TASK], self.factors[TASK], self.config.context_length)}
         return make_window(
             read_batch(batch, self.config.features, self.device),
             self.config.features,
@@ -269,7 +279,8 @@ class UniMASKPolicy(PreTrainedPolicy):
 
         Args:
             batch: `observation.state` (B, D) of this step; `observation.return_so_far` (B, 1) where a return is asked
-                for and the episode is longer than the window. Not changed.
+                for and the episode is longer than the window; `task`, a text or (B,) of them, where the model has
+                several. Not changed.
             mask: question of this step, instead of `inference_mask`. While actions of a chunk are left, none is put.
             given: values of single tokens, instead of the config's: of positions in the window, `s[-1]`, or of steps
                 of the episode, `s@150`. What has been observed wins over them.
@@ -289,7 +300,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             self._memory = new_memory(self, len(state))
         question = {"mask": mask, "given": given, "sample": sample, "generator": generator}
         with _evaluation(self):
-            return act(self, self._memory, state, so_far, **question)
+            return act(self, self._memory, state, so_far, batch.get(TASK), **question)
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -301,9 +312,9 @@ class UniMASKPolicy(PreTrainedPolicy):
     ) -> Tensor:
         """A chunk for this observation, (B, H, D). Nothing is remembered, so that a server or a thread may call it at
         any time; for arguments see `asking.acting.plan_from`."""
-        state = observed_state(self, batch)
+        how = {"inference_delay": inference_delay, "left_over": prev_chunk_left_over, **kwargs}
         with _evaluation(self):
-            return plan_from(self, state, inference_delay=inference_delay, left_over=prev_chunk_left_over, **kwargs)
+            return plan_from(self, observed_state(self, batch), batch.get(TASK), **how)
 
     def supports_rtc(self) -> bool:
         """Whether LeRobot may act by real-time chunking: there is more than one action to a chunk."""

@@ -8,7 +8,7 @@ Legend of shapes: B environments, K steps, D the numbers of a factor, H actions 
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -28,7 +28,7 @@ from lerobot_unimask.asking.given import (
 from lerobot_unimask.asking.memory import NO_RETURN_SO_FAR, RolloutMemory
 from lerobot_unimask.asking.sampling import sample as draw_jointly
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.data.factors import RETURN_SO_FAR, Factor
+from lerobot_unimask.data.factors import RETURN_SO_FAR, TASK, Factor, category_numbers
 from lerobot_unimask.data.returns import EpisodeStarts
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.grammar import MaskError
@@ -50,6 +50,7 @@ def act(
     memory: RolloutMemory,
     state: Tensor,
     return_so_far: Tensor | None,
+    task: str | Sequence[str] | None,
     **question: Any,
 ) -> Tensor:
     """One action for each environment.
@@ -57,11 +58,13 @@ def act(
     Args:
         state: (B, D) of the present step, as `observed_state` reads it.
         return_so_far: (B,) rewards received before it, as `observed_return` reads it.
+        task: text of each environment's, or of all, where they say one.
         question: `mask`, `given`, `sample` and `generator`, as `UniMASKPolicy.select_action` takes them.
 
     Returns:
         (B, D) in the dataset's units.
     """
+    memory.task = task
     memory.observe(state, return_so_far)
     if not memory.planned:
         actions = plan(model, memory, **question)
@@ -74,6 +77,7 @@ def act(
 def plan_from(
     model: ActingModel,
     state: Tensor,
+    task: str | Sequence[str] | None,
     *,
     inference_delay: int = 0,
     left_over: Tensor | None = None,
@@ -87,6 +91,7 @@ def plan_from(
 
     Args:
         state: (B, D) of the present step.
+        task: text of each environment's, or of all, where they say one.
         inference_delay: number of actions of `left_over` that will be done by the time the chunk is there.
         left_over: (T, D) actions of the chunk before that are still to be carried out, the next one first; rows of
             zeros at its end are LeRobot's padding and do not count.
@@ -99,6 +104,7 @@ def plan_from(
         ValueError: `left_over` is not (T, D), or the delay is negative.
     """
     memory = new_memory(model, len(state))
+    memory.task = task
     memory.observe(state, torch.zeros(len(state), device=model.device))
     prefix = _on_their_way(model, inference_delay, left_over)
     return as_action(model, plan(model, memory, prefix=prefix, **question))
@@ -145,6 +151,8 @@ def plan(
         check_shown(tokens, table.shows, text)
     horizon = int(model.statistics.horizon)
     here = in_window(tokens, memory.first_step, config.context_length, horizon)
+    if TASK in model.factors and table.shows[TASK][0] and (TASK, 0) not in here and memory.task is not None:
+        here[TASK, 0] = torch.tensor(category_numbers(memory.task, model.factors[TASK]))
     if "rtg" in model.factors and table.shows["rtg"][0]:
         target = here.get(("rtg", 0), target_return(model, memory))
         if target is not None:
@@ -293,7 +301,7 @@ def check_settings(config: UniMASKConfig, factors: Mapping[str, Factor]) -> None
         f"{name}[{step}]"
         for name, ahead in table.shows_ahead.items()
         for step in ahead.nonzero().flatten().tolist()
-        if Token(name, step) not in tokens
+        if Token(name, step) not in tokens and name != TASK  # which environments say
     ]
     if missing:
         logger.warning(

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.factors import Factor, category_numbers
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.masks import Mask, Token, parse_token
 
@@ -86,6 +86,9 @@ def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
     """(B, given_size) or (1, given_size), checked."""
     size = factor.given_size
     numbers = f"{size} number{'s' * (size > 1)}"
+    texts = [value] if isinstance(value, str) else value
+    if factor.components[0].labels and isinstance(texts, list | tuple) and any(isinstance(one, str) for one in texts):
+        value = category_numbers(texts, factor)
     try:
         token = as_tensor(text, value).float()
     except ValueError as error:

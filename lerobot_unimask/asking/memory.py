@@ -3,7 +3,7 @@
 Legend of shapes: B environments, K steps, D the numbers of a factor.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -42,6 +42,7 @@ class RolloutMemory:
         self.values = {name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()}
         self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
         self.first_state: Tensor | None = None  # (B, D)
+        self.task: str | Sequence[str] | None = None  # what each environment is to do, as it says at this step
         self.planned: list[Tensor] = []  # actions of a chunk that are still to be carried out, each (B, D)
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
         self.cache = Cache()  # of the steps in the window, until it slides

@@ -29,7 +29,20 @@ def add(commands: Any) -> None:
         study.set_defaults(run=_study)
     _add_curve(parts)
     _add_questions(parts)
+    _add_chunks(parts)
     _add_gallery(parts)
+
+
+def _add_chunks(parts: Any) -> None:
+    chunks = add_command(parts, "chunks", "Maze2D in chunks and by real-time chunking: returns, costs, jumps at seams")
+    policy_flags(chunks)
+    chunks.add_argument("--dataset.root", type=Path, required=True, dest="data", metavar="DIR", help="Maze2D episodes")
+    chunks.add_argument("--episodes", type=positive, default=1000, help="rollouts of each way of acting")
+    chunks.add_argument("--rtc_episodes", type=positive, default=200, help="rollouts of each delay")
+    chunks.add_argument("--batch_size", type=positive, default=100, help="environments side by side")
+    chunks.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
+    output_flag(chunks)
+    chunks.set_defaults(run=_chunks)
 
 
 def _add_curve(parts: Any) -> None:
@@ -84,6 +97,29 @@ def _study(arguments: argparse.Namespace) -> None:
     config = read_config(kind, arguments.config_path)
     print(markdown(run(config, storage=arguments.storage, workers=arguments.workers)))
     print(f"written to {config.output}")
+
+
+def _chunks(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.data.checkpoints import last_checkpoint, training_settings
+    from lerobot_unimask.paper.chunks import markdown, measure_chunks
+    from lerobot_unimask.records import write_json
+
+    folder = last_checkpoint(Path(arguments.path))
+    record = measure_chunks(
+        folder,
+        arguments.data,
+        episodes=arguments.episodes,
+        rtc_episodes=arguments.rtc_episodes,
+        batch_size=arguments.batch_size,
+        chunk_size=8,
+        carried_out=(1, 4, 8),
+        delays=(0, 2, 4, 8),
+        seed=arguments.seed,
+    )
+    record["training"] = training_settings(folder)
+    print(markdown(record))
+    if arguments.output:
+        write_json(arguments.output, {**record, "command": arguments.text})
 
 
 def _curve(arguments: argparse.Namespace) -> None:

@@ -13,7 +13,7 @@ ENVIRONMENT_STATE = "observation.environment_state"
 ACTION = "action"
 RETURN_TO_GO = "observation.return_to_go"
 RETURN_SO_FAR = "observation.return_so_far"
-TAKEN = (STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are factors already
+TASK = "task"  # LeRobot's name for what an episode is to do, a text; here the factor that it becomes, too
 
 MAX_SIZE = 65536  # numbers of a column, categories of a number: more is a damaged file
 LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
@@ -27,6 +27,7 @@ class Feature:
     size: int
     categories: list[int] | None = None  # per dimension; None: continuous
     names: list[str] | None = field(default=None, compare=False)  # per dimension, for people
+    labels: list[str] | None = None  # of the categories, where the dataset stores texts
 
     def __post_init__(self) -> None:
         if not 1 <= self.size <= MAX_SIZE:
@@ -49,6 +50,7 @@ class Component:
     computed: bool = False  # by this package, not stored in the dataset or given by a user
     gaussian: bool = False  # continuous, predicted as a mean and a scale
     names: tuple[str, ...] = ()  # of its numbers
+    labels: tuple[str, ...] = ()  # of its categories, where they are texts
 
     @property
     def discrete(self) -> bool:
@@ -96,7 +98,8 @@ def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = 
                 components.append(Component(label, dims, None, gaussian=gaussian, names=_names(feature)))
             else:
                 for i, (label, count) in enumerate(zip(_names(feature), feature.categories, strict=True)):
-                    components.append(Component(label, slice(start + i, start + i + 1), count, names=(label,)))
+                    dims, labels = slice(start + i, start + i + 1), tuple(feature.labels or ())
+                    components.append(Component(label, dims, count, names=(label,), labels=labels))
             start += feature.size
         if name == "rtg":  # the token is the pair (return-to-go, timestep / horizon)
             components.append(Component("timestep", slice(start, start + 1), None, computed=True))
@@ -137,31 +140,68 @@ def declared_feature(key: str, feature: PolicyFeature) -> Feature:
     return Feature(key, feature.shape[0] if feature.shape else 1)
 
 
-def group_features(found: dict[str, Feature], properties: Sequence[str]) -> dict[str, list[Feature]]:
+def category_numbers(texts: str | Sequence[str], factor: Factor) -> list[list[float]]:
+    """The categories that texts name, one row of one number for each.
+
+    Raises:
+        ValueError: a text that is none of them.
+    """
+    labels = factor.components[0].labels
+    texts = [texts] if isinstance(texts, str) else texts
+    for text in texts:
+        if text not in labels:
+            known = ", ".join(map(repr, labels))
+            raise ValueError(f"{factor.name} is {text!r}, which this model has not seen; it knows {known}.")
+    return [[float(labels.index(text))] for text in texts]
+
+
+def group_features(
+    found: dict[str, Feature], properties: Sequence[str], states: Sequence[str] | None = None
+) -> dict[str, list[Feature]]:
     """Which factor each column belongs to. `s` is what LeRobot calls the robot's and the environment's state: a label
-    of the episode under another name must never slip into it, for no environment reports one."""
-    states = [found[key] for key in (STATE, ENVIRONMENT_STATE) if key in found]
+    of the episode under another name must never slip into it, for no environment reports one.
+
+    Args:
+        properties: columns that label whole episodes.
+        states: columns that make up `s`; None: the robot's and the environment's state, where they are there.
+
+    Raises:
+        ValueError: a column is missing, or cannot be what it is named as.
+    """
+    columns = [key for key in found if key.startswith(OBS_PREFIX) and key != RETURN_TO_GO]
+    for key in states or ():
+        if key not in columns or list(states).count(key) > 1:
+            raise ValueError(f"states names {key!r}; name each of its columns once, of {', '.join(columns) or 'none'}.")
+    states = [key for key in (STATE, ENVIRONMENT_STATE) if key in found] if states is None else list(states)
+    taken = (*states, STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are no properties
     if not states:
-        raise ValueError(f"The dataset has no {STATE!r}: UniMASK models states and actions. It has {list(found)}.")
+        raise ValueError(
+            f"The dataset has no {STATE!r}: UniMASK models states and actions. It has {list(found)}; "
+            "--policy.states names others."
+        )
     if ACTION not in found:
         raise ValueError(f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}.")
-    features = {"s": states, "a": [found[ACTION]]}
+    features = {"s": [found[key] for key in states], "a": [found[ACTION]]}
     if RETURN_TO_GO in found:
         features["rtg"] = [found[RETURN_TO_GO]]
     for key in properties:
         name = key.rpartition(".")[-1]
         if key not in found:
-            others = [other for other in found if other.startswith(OBS_PREFIX) and other not in TAKEN]
+            others = [other for other in found if other.startswith(OBS_PREFIX) and other not in taken]
             raise ValueError(
                 f"properties names {key!r}, which the dataset does not have; columns that could be one: "
                 f"{', '.join(others) or 'none'}. `unimask label` adds one."
             )
-        if key in TAKEN or found[key] in features.get(name, []):
+        if key in taken or found[key] in features.get(name, []):
             raise ValueError(f"{key!r} is a factor already, so it cannot be named in properties as well.")
-        if not key.startswith(OBS_PREFIX) or not re.fullmatch(r"[A-Za-z_]\w*", name) or name in ("t", "rtg", *features):
+        if (
+            not key.startswith(OBS_PREFIX)
+            or not re.fullmatch(r"[A-Za-z_]\w*", name)
+            or name in ("t", "rtg", TASK, *features)
+        ):
             raise ValueError(
                 f"{key!r} cannot be a property: it is named observation.NAME, NAME is letters, digits and "
-                f"underscores, and s, a, t, rtg and other properties' names are taken."
+                f"underscores, and s, a, t, rtg, task and other properties' names are taken."
             )
         features[name] = [found[key]]
     return features

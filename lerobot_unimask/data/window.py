@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_unimask.data.factors import ACTION, LOG_SCALE, STATE, Component, Factor, Feature
+from lerobot_unimask.data.factors import ACTION, LOG_SCALE, STATE, Component, Factor, Feature, category_numbers
 
 
 @dataclass
@@ -130,6 +130,15 @@ def as_tensor(what: str, value: Any, device: torch.device | None = None) -> Tens
             f"{what} is no plain tensor of numbers but one of {tensor.dtype}, {tensor.layout}, on {tensor.device}."
         )
     return tensor if device is None else tensor.to(device)
+
+
+def task_column(texts: str | Sequence[str], factor: Factor, context_length: int) -> Tensor:
+    """LeRobot's `task`, a text for each of B windows, as a column, (B, K, 1).
+
+    Raises:
+        ValueError: a text that is none of the factor's.
+    """
+    return torch.tensor(category_numbers(texts, factor)).unsqueeze(1).expand(-1, context_length, -1)
 
 
 def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:

@@ -4,14 +4,18 @@ One environment is one `EnvConfig` of a few lines: its `task`, which with the pa
 `fps`, and the shapes of what it takes and gives.
 """
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from lerobot_unimask.envs.returns import ReportReturn
 
 
 def state_and_action(state: int, action: int) -> dict[str, PolicyFeature]:
@@ -107,3 +111,39 @@ class MetaWorldEnvConfig(UniMASKEnvConfig):
     @property
     def gym_kwargs(self) -> Mapping[str, Any]:
         return {**super().gym_kwargs, "task": self.task, "objects": self.objects}
+
+
+@EnvConfig.register_subclass("gymnasium")
+@dataclass
+class GymnasiumEnvConfig(UniMASKEnvConfig):
+    """`--env.type=gymnasium --env.task=Pendulum-v1`: any gymnasium environment with continuous actions, as
+    one that reports what it has paid so far.
+
+    Raises:
+        ValueError: no task is named, or its actions are not continuous.
+    """
+
+    task: str | None = None
+    package: str | None = None  # whose import registers the environment, such as gym_pusht
+    fps: int = 30
+
+    def __post_init__(self) -> None:
+        if self.task is None:
+            raise ValueError("Which environment? --env.type=gymnasium needs --env.task=ITS-GYMNASIUM-ID.")
+        if self.package:
+            importlib.import_module(self.package)
+        env = self._make()
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise ValueError(f"{self.task} takes {env.action_space}; --env.type=gymnasium takes continuous actions.")
+        own = {name: space for name, space in env.observation_space.spaces.items() if len(space.shape or ()) == 1}
+        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, env.action_space.shape)}
+        self.features |= {name: PolicyFeature(FeatureType.STATE, space.shape) for name, space in own.items()}
+        self.features_map |= {name: f"observation.{name}" for name in own if name not in self.features_map}
+        env.close()
+
+    def _make(self) -> gym.Env:
+        return ReportReturn(gym.make(self.task, disable_env_checker=True, **self.gym_kwargs))
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """As the other environments'."""
+        return {self.type: {0: SyncVectorEnv([self._make] * n_envs, autoreset_mode=AutoresetMode.SAME_STEP)}}

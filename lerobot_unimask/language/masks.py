@@ -78,8 +78,8 @@ def parse_token(text: str, factors: Sequence[str], context_length: int) -> Token
     return Token(terms[0].factor, int(chosen.any(0).int().argmax()))
 
 
-def parse(text: str) -> Question:
-    """Parse one mask text or the name of a task in `TASKS`.
+def parse(text: str, factors: Sequence[str] = ()) -> Question:
+    """Parse one mask text or the name of a task in `TASKS`, whose rows show `task[0]` too where that is a factor.
 
     Raises:
         MaskError: the text does not parse; shows it with a caret under the fault.
@@ -98,7 +98,7 @@ def parse(text: str) -> Question:
                 text,
                 text.index(name),
             )
-        text = TASKS[name]
+        text = f"{TASKS[name]}, task[0]" if "task" in factors else TASKS[name]
     return parse_question(text)
 
 
@@ -179,7 +179,7 @@ def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTa
     Raises:
         MaskError: unknown factor, a step outside the window, a property asked for or shown after step 0, nothing asked.
     """
-    question = parse(text)
+    question = parse(text, factors)
     text = question.text
     _check_factors(question.terms, factors, text)
     for term in question.asked:

@@ -4,7 +4,8 @@ Legend of shapes: B windows, K steps, D the dimensions of a factor.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, MutableMapping
+from typing import Any
 
 import torch
 from torch import Tensor, distributed
@@ -14,17 +15,25 @@ from lerobot_unimask.data.factors import LOG_SCALE, Component, Factor
 from lerobot_unimask.data.window import Window
 
 
-class LossParts(Mapping[str, float]):
+class LossParts(MutableMapping[str, Any]):
     """What makes up a loss, for the log: scalar tensors, read off the device when somebody asks for the numbers.
 
-    lerobot-train does so once it has waited for the update, so that between forward and backward nothing waits.
+    lerobot-train does so once it has waited for the update, so that between forward and backward nothing waits; what it
+    has to log besides it writes in here.
     """
 
-    def __init__(self, parts: Mapping[str, Tensor | float]):
+    def __init__(self, parts: dict[str, Any]):
         self._parts = parts
 
-    def __getitem__(self, name: str) -> float:
-        return float(self._parts[name])
+    def __getitem__(self, name: str) -> Any:
+        part = self._parts[name]
+        return float(part) if isinstance(part, Tensor) else part
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._parts[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self._parts[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._parts)
@@ -70,7 +79,12 @@ def token_count(asked: Tensor) -> Tensor:
 
 
 def masked_losses(
-    predictions: dict[str, list[Tensor]], window: Window, asked: dict[str, Tensor], factors: dict[str, Factor]
+    predictions: dict[str, list[Tensor]],
+    window: Window,
+    asked: dict[str, Tensor],
+    factors: dict[str, Factor],
+    *,
+    reduction: str = "mean",
 ) -> dict[str, Tensor]:
     """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up. With several
     processes it is this process's part in the mean over all their tokens, see `token_count`.
@@ -79,18 +93,28 @@ def masked_losses(
         predictions: factor -> one (B, K, size) per component, as a network puts them out.
         window: the recorded values, normalised.
         asked: factor -> (B, K) bool, True = asked for; never a step outside the episode.
+        reduction: "mean"; or "none", each window's part, whose mean over the windows is that mean.
 
     Returns:
-        factor -> scalar; 0 where nothing of the factor is asked.
+        factor -> scalar, or (B,); 0 where nothing of the factor is asked.
+
+    Raises:
+        ValueError: another reduction.
     """
+    if reduction not in ("mean", "none"):
+        raise ValueError(f"reduction is {reduction!r}; choose mean or none.")
     losses = {}
     for name, outputs in predictions.items():
         here = asked[name]
         # Replaced where not asked: past the end of an episode anything may stand, even no number at all.
         value = torch.where(here.unsqueeze(-1), window.values[name], 0.0)
         count = token_count(here)
-        losses[name] = sum(
-            (component_loss(output, value, component) * here).sum() / count
+        costs = (
+            component_loss(output, value, component) * here  # (B, K)
             for output, component in zip(outputs, factors[name].components, strict=True)
         )
+        if reduction == "none":
+            losses[name] = sum(cost.sum(1) * (len(here) / count) for cost in costs)
+        else:
+            losses[name] = sum(cost.sum() / count for cost in costs)
     return losses

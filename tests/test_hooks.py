@@ -1,0 +1,177 @@
+"""LeRobot's other hooks: losses of windows, recorded evaluations, renamed columns, adapters, other environments."""
+
+import json
+import re
+
+import commands
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from policies import CONTINUOUS_STATS
+from torch import nn
+
+from lerobot_unimask.envs.configs import GymnasiumEnvConfig
+from lerobot_unimask.envs.returns import ReportReturn
+
+
+@pytest.mark.parametrize("masks", ["random_mask", "past"])
+def test_the_mean_over_windows_is_the_loss(tiny_policy, batch_of, kind, masks):
+    policy = tiny_policy(kind, training_masks=masks).train()
+    loss, parts = policy.forward(batch_of(kind))
+    each, same_parts = policy.forward(batch_of(kind), reduction="none")
+    assert each.shape == (len(batch_of(kind)["action"]),)
+    torch.testing.assert_close(each.mean(), loss, rtol=1e-5, atol=1e-6)
+    assert dict(same_parts) == pytest.approx(dict(parts), rel=1e-4)
+
+
+def test_a_windows_part_is_its_own(tiny_policy, doorkey_batch):
+    """What is recorded in another window does not matter to it."""
+    policy = tiny_policy(training_masks="a[t] | s[t]").train()
+    before, _ = policy.forward(doorkey_batch, reduction="none")
+    changed = {**doorkey_batch, "action": doorkey_batch["action"].clone()}
+    changed["action"][0] = 3 - changed["action"][0]
+    after, _ = policy.forward(changed, reduction="none")
+    assert after[0] != before[0]
+    assert torch.equal(after[1:], before[1:])
+
+
+def test_another_reduction_is_refused(tiny_policy, doorkey_batch):
+    with pytest.raises(ValueError, match=r"sum.*mean or none"):
+        tiny_policy().forward(doorkey_batch, reduction="sum")
+
+
+def test_lerobot_train_weights_samples(doorkey_root, tmp_path):
+    small = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
+    log = commands.check(
+        "lerobot-train",
+        "--policy.type=unimask",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        *small,
+        "--dataset.repo_id=local/doorkey",
+        f"--dataset.root={doorkey_root}",
+        "--sample_weighting.type=uniform",
+        "--steps=2",
+        "--batch_size=4",
+        "--log_freq=1",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        "--output_dir=run",
+        cwd=tmp_path,
+    )
+    assert "End of training" in log
+
+
+@pytest.mark.parametrize("network", ["transformer", "feedforward", "decision_transformer"])
+def test_adapters_go_to_every_linear_layer(tiny_policy, network):
+    policy = tiny_policy("continuous", network=network, attention=None)
+    pattern = policy._get_default_peft_targets()["target_modules"]
+    linear = {name for name, module in policy.named_modules() if isinstance(module, nn.Linear)}
+    assert {name for name, _ in policy.named_modules() if re.fullmatch(pattern, name)} == linear
+
+
+def test_an_evaluation_records_doorkeys_integers(tiny_policy, tmp_path):
+    tiny_policy().save_pretrained(tmp_path / "policy")
+    commands.check(
+        "lerobot-eval",
+        "--policy.path=policy",
+        "--env.type=doorkey",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--eval.recording=true",
+        "--output_dir=eval",
+        cwd=tmp_path,
+    )
+    (info,) = (tmp_path / "eval").rglob("meta/info.json")
+    assert json.loads(info.read_text())["total_episodes"] == 1
+
+
+@pytest.fixture
+def pendulum_policy(tiny_policy):
+    features = {
+        "observation.angle": {"dtype": "float32", "shape": (3,), "names": None},
+        "action": {"dtype": "float32", "shape": (1,), "names": None},
+        "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": None},
+    }
+    stats = {
+        key: {"mean": [0.0] * entry["shape"][0], "std": [1.0] * entry["shape"][0]} for key, entry in features.items()
+    }
+    return tiny_policy(
+        "gaussian",
+        features=features,
+        stats=stats | {"frame_index": {"max": [199.0]}, "timestamp": {"max": [6.6]}},
+        states=["observation.angle"],
+        context_length=4,
+        target_return=-100.0,
+        inference_mask="reward_conditioned",
+    )
+
+
+def test_any_gymnasium_environment_reports_its_return_and_columns_are_renamed(pendulum_policy, tmp_path):
+    pendulum_policy.save_pretrained(tmp_path / "policy")
+    commands.check(
+        "lerobot-eval",
+        "--policy.path=policy",
+        "--env.type=gymnasium",
+        "--env.task=Pendulum-v1",
+        '--rename_map={"observation.state": "observation.angle"}',
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--eval.recording=true",  # and so no videos
+        "--output_dir=eval",
+        cwd=tmp_path,
+    )
+    info = json.loads((tmp_path / "eval/eval_info.json").read_text())
+    assert len(info["per_task"][0]["metrics"]["sum_rewards"]) == 2
+
+
+def test_without_it_a_return_cannot_be_asked_for_and_the_first_step_says_so(pendulum_policy):
+    with pytest.raises(ValueError, match="return_so_far"):
+        pendulum_policy.select_action({"observation.angle": torch.zeros(1, 3)})
+
+
+def test_the_return_so_far_is_the_sum_of_rewards():
+    env = ReportReturn(gym.make("Pendulum-v1"))
+    observation, _ = env.reset(seed=0)
+    assert observation in env.observation_space
+    paid = 0.0
+    for _ in range(5):
+        assert observation["return_so_far"] == pytest.approx(np.array([paid]))
+        observation, reward, *_ = env.step(np.array([0.5], np.float32))
+        paid += reward
+    assert env.reset(seed=0)[0]["return_so_far"] == 0
+
+
+@pytest.mark.parametrize(("task", "message"), [(None, "env.task"), ("CartPole-v1", "continuous")])
+def test_an_environment_that_does_not_fit_is_refused(task, message):
+    with pytest.raises(ValueError, match=message):
+        GymnasiumEnvConfig(task=task)
+
+
+# --- Which columns make up the state ---------------------------------------------------------------------------------
+
+COLUMNS = {
+    "observation.state": {"dtype": "float32", "shape": (3,), "names": None},
+    "observation.velocity": {"dtype": "float32", "shape": (2,), "names": None},
+    "observation.current": {"dtype": "float32", "shape": (1,), "names": None},
+    "action": {"dtype": "float32", "shape": (2,), "names": None},
+}
+
+
+def test_states_are_made_up_of_the_columns_that_are_named(tiny_policy):
+    stats = {key: {"mean": [1.0] * e["shape"][0], "std": [2.0] * e["shape"][0]} for key, e in COLUMNS.items()}
+    policy = tiny_policy(
+        "gaussian", features=COLUMNS, stats=stats, states=["observation.velocity", "observation.state"]
+    )
+    assert policy.factors["s"].size == 5
+    observed = {"observation.velocity": torch.ones(1, 2), "observation.state": torch.full((1, 3), 7.0)}
+    assert policy.select_action(observed).shape == (1, 2)
+    assert policy._memory.values["s"][0, 0].tolist() == [1, 1, 7, 7, 7]
+    assert tiny_policy("gaussian", features=COLUMNS, stats=CONTINUOUS_STATS).factors["s"].size == 3
+
+
+@pytest.mark.parametrize("states", [["observation.speed"], ["action"], ["observation.state"] * 2, []])
+def test_columns_that_cannot_be_states_are_refused(tiny_policy, states):
+    with pytest.raises(ValueError, match=r"states|observation\.state"):
+        tiny_policy("gaussian", features=COLUMNS, stats=CONTINUOUS_STATS, states=states)
