@@ -40,7 +40,8 @@ def given_from_episodes(
 
     Args:
         episodes: their numbers, `0:50` or `3,5,7`.
-        tokens: single tokens of the window at the episode's first step, `s[3], s[-1]`.
+        tokens: single tokens of the window at the episode's first step, `s[3], s[-1]`, or of steps of the episode,
+            `s@150`.
 
     Raises:
         MaskError: a token that the window does not have.
@@ -49,14 +50,15 @@ def given_from_episodes(
     numbers = episode_numbers(episodes, len(dataset.meta.episodes))
     windows = [policy.make_window(read_window(dataset, number), partial=True) for number in numbers]
     rows = {}
-    for text in re.findall(r"[^,\[]+\[[^\]]*\]", tokens) or [tokens]:
+    for text in re.split(r",(?![^\[]*\])", tokens):  # at commas outside brackets
         token = parse_token(text.strip(), tuple(policy.factors), policy.config.context_length)
+        name, step, here = token.factor, token.step, windows
         if token.of_episode:
-            raise ValueError(f"{token} is a moment of the episode; name a token of its first window, as s[3].")
-        name, step = token.factor, token.step
+            here = [policy.make_window(read_window(dataset, number, step), partial=True) for number in numbers]
+            step = 0
         factor = policy.factors[name]
-        values = torch.stack([window.values[name][0, step, : factor.given_size] for window in windows])
-        short = [number for number, window in zip(numbers, windows, strict=True) if not window.valid[0, step]]
+        values = torch.stack([window.values[name][0, step, : factor.given_size] for window in here])
+        short = [number for number, window in zip(numbers, here, strict=True) if not window.valid[0, step]]
         if short or values.isnan().any():
             where = f"episode {short[0]}, which is shorter" if short else "this dataset"
             raise ValueError(f"{text.strip()} is not recorded in {where}.")

@@ -346,6 +346,10 @@ def test_goals_of_recorded_episodes_are_what_policy_given_takes(checkpoint, door
     policy.select_action({"observation.state": states[:, 0].float()})
     cli.main(["given", *flags, "--dataset.episodes=4"])
     assert json.loads(capsys.readouterr().out) == {"s[-1]": states[2:, 9].tolist()}
+    cli.main(["given", *flags, "--dataset.episodes=2:5", "--tokens=s@7, s[3]"])  # of the episode, and of its window
+    given = json.loads(capsys.readouterr().out)
+    assert given == {"s@7": states[:, 7].tolist(), "s[3]": states[:, 3].tolist()}
+    tiny_policy(given={"s@7": given["s@7"]}).select_action({"observation.state": states[:, 0].float()})
 
 
 @pytest.mark.parametrize(
@@ -354,6 +358,7 @@ def test_goals_of_recorded_episodes_are_what_policy_given_takes(checkpoint, door
         (["--dataset.episodes=20:40"], "this dataset's are 0 to 29"),
         (["--dataset.episodes=few"], "write 0:50 or 3,5,7"),
         (["--dataset.episodes=0:2", "--tokens=s[12]"], "its steps are 0 to 9"),
+        (["--dataset.episodes=0:2", "--tokens=s@500"], "has no step 500"),
         (["--dataset.episodes=0:2", "--tokens=goal"], "Expected '['"),
     ],
 )
