@@ -20,6 +20,7 @@ from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
+from lerobot_unimask.data.episodes import read_info
 from lerobot_unimask.sharing import hub
 
 logger = logging.getLogger(__name__)
@@ -74,6 +75,9 @@ def _read_as_this_policy_needs() -> None:
                 "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
                 "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
             )
+        root = Path(cfg.dataset.root or "")
+        if cfg.trainable_config.type == "unimask" and cfg.dataset.root and (root / "meta" / "info.json").exists():
+            read_info(root)  # a damaged one ends in one sentence
         dataset = lerobots_make_dataset(cfg)
         if cfg.trainable_config.type == "unimask" and cfg.num_workers and getattr(dataset, "__getitems__", None):
             logger.info("Windows are read in batches, faster than workers start: num_workers=0.")

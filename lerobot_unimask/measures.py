@@ -4,8 +4,10 @@ agree, how long they take.
 Legend of shapes: B windows, K steps, D the dimensions of a state.
 """
 
+import logging
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,10 +15,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_unimask.asking.answers import answer as answer_question
+from lerobot_unimask.data.checkpoints import episodes_trained_on
 from lerobot_unimask.data.episodes import bounds_of, read_windows
 from lerobot_unimask.data.factors import RETURN_SO_FAR, Component
 from lerobot_unimask.language.masks import Mask, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+logger = logging.getLogger(__name__)
 
 EVERY = 7  # steps between the windows that are read
 
@@ -139,12 +144,18 @@ def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> d
 def measure(policy: UniMASKPolicy, dataset: LeRobotDataset, episodes: Sequence[int], *, ahead: int) -> dict[str, Any]:
     """A JSON record of all that applies to this policy, over windows of episodes that it was not trained on."""
     batch = unseen_windows(dataset, policy.config.context_length, episodes)
+    known = episodes_trained_on(policy.folder, Path(dataset.root), dataset.repo_id, len(dataset.meta.episodes))
+    seen = set(episodes) & set(known)
     record: dict[str, Any] = {
-        "what": "action_error: mean squared, in standard deviations of the data; ahead: mean distance, in the "
+        "what": "a policy's answers about episodes that it was not trained on",
+        "units": "action_error: mean squared, in standard deviations of the data; ahead: mean distance, in the "
         "dataset's units; disagreement: nats; latency: milliseconds",
         "windows": len(batch["index"]),
         "episodes": len(episodes),
+        "trained_on_episodes": len(seen),
     }
+    if seen:
+        logger.warning("The policy was trained on %d of these %d episodes.", len(seen), len(episodes))
     questions = ["behavior_cloning"] + ["reward_conditioned"] * ("rtg" in policy.factors)
     if not any(component.discrete for component in policy.factors["a"].components):
         record["action_error"] = {question: action_error(policy, batch, question) for question in questions}

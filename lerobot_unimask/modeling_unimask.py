@@ -86,6 +86,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         self.network = make_network(config, self.factors)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
         self.origin: hub.Origin | None = None  # where it was loaded from
+        self.folder: Path | None = None  # of the files that were loaded, on this machine
         self.reset()
 
     def _read_dataset(self, stats: Mapping[str, Mapping[str, Any]] | None, meta: LeRobotDatasetMetadata | None) -> None:
@@ -364,7 +365,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)
         policy._read_dataset(dataset_stats, dataset_meta)
-        policy.origin = hub.Origin(source, hub.commit_of(folder))
+        policy.origin, policy.folder = hub.Origin(source, hub.commit_of(folder)), folder
         return policy
 
     def describe_origin(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_unimask.data.checkpoints import checkpoints_of, training_settings, was_trained_on
+from lerobot_unimask.data.checkpoints import checkpoints_of, episodes_trained_on, training_settings
 from lerobot_unimask.data.episodes import first_windows, open_dataset, provenance_of
 from lerobot_unimask.envs import environment_of_states
 from lerobot_unimask.envs.record import check_expert
@@ -120,15 +120,25 @@ def validate(
             updates = int(policy.updates)
             curve[updates] = losses.get(RANDOM_MASK, sum(losses.values()) / len(losses))
             if curve[updates] == min(curve.values()):
-                best, best_policy = {"updates": updates, "losses": losses, "training": training_settings(path)}, policy
+                best, best_policy = (
+                    {"updates": updates, "losses": losses, "training": training_settings(policy.folder)},
+                    policy,
+                )
                 if "forward_dynamics" in masks and all(c.discrete for c in policy.factors["s"].components):
                     truth = probability_of_truth(policy, batch, "forward_dynamics")
                     best["forward_dynamics_probability_of_truth"] = truth
             logger.info("%s: %.4f", path, curve[updates])
-        results.append({**best, "random_mask_loss_by_updates": curve})
         chosen.append(best_policy)
-        if was_trained_on(path, Path(dataset.root), repo_id):
-            logger.warning("%s was trained on this dataset: these losses are not those of unseen episodes.", run)
+        count = len(batch["index"])
+        seen = len(episodes_trained_on(best_policy.folder, Path(dataset.root), repo_id, count))
+        results.append({**best, "trained_on_episodes": seen, "random_mask_loss_by_updates": curve})
+        if seen:
+            logger.warning(
+                "%s was trained on %d of these %d episodes: these losses are not those of unseen ones.",
+                run,
+                seen,
+                count,
+            )
     tasks = list(results[0]["losses"])
     values = {task: [result["losses"][task] for result in results] for task in tasks}
     optimum: dict[str, Any] = {}
@@ -139,7 +149,8 @@ def validate(
             result["above_optimum"] = {task: loss - lowest[task] for task, loss in result["losses"].items()}
             result.update(distance)
     return {
-        "what": "validation loss in nats per task; one window from each episode's first step, t uniform",
+        "what": "validation loss per task; one window from each episode's first step, t uniform",
+        "units": "losses, mean, spread, optimum and what lies above it: nats; probabilities: 0 to 1",
         "validation_episodes": len(batch["index"]),
         "validation_data": provenance,
         "mean": {task: sum(numbers) / len(numbers) for task, numbers in values.items()},

@@ -116,7 +116,7 @@ def test_directions_that_say_the_same_disagree_by_nothing(make, root):
 def test_a_record_holds_what_applies(make, root, settings, ahead, parts):
     policy = make(**settings)
     record = measure(policy, open_dataset(policy.config, root), LAST, ahead=ahead)
-    assert set(record) == {"what", "windows", "episodes"} | parts
+    assert set(record) == {"what", "units", "windows", "episodes", "trained_on_episodes"} | parts
 
 
 def test_latency_is_a_median_between_quartiles(make):

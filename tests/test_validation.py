@@ -9,11 +9,12 @@ import pytest
 import torch
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask import TASKS, UniMASKPolicy
-from lerobot_unimask.data.checkpoints import checkpoints_of
+from lerobot_unimask.data.checkpoints import checkpoints_of, episodes_trained_on, last_checkpoint
 from lerobot_unimask.data.episodes import first_windows, open_dataset
 from lerobot_unimask.language.masks import RANDOM_MASK, Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
@@ -185,6 +186,7 @@ def test_the_record_is_complete_and_names_no_place_on_this_machine(runs, tmp_pat
     assert '"/' not in text
     assert record.keys() == {
         "what",
+        "units",
         "validation_episodes",
         "validation_data",
         "mean",
@@ -228,6 +230,34 @@ def test_a_model_that_answers_some_tasks_alone_is_validated_on_those(tiny_policy
     (result,) = validate([tmp_path], doorkey_root, exact="paper")["runs"]
     assert result["losses"].keys() == result["divergence"].keys() == {"behavior_cloning"}
     assert "random_mask_divergence" not in result
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "seen"),
+    [
+        ({"root": "here", "repo_id": "me/data", "episodes": None}, 30),
+        ({"root": "here", "repo_id": "me/data", "episodes": [3, 1, 2, 99]}, 3),
+        ({"root": "elsewhere", "repo_id": "local/dataset", "episodes": None}, 0),
+        ({"root": None, "repo_id": "local/dataset", "episodes": None}, 30),
+        ({"root": None, "repo_id": "me/data", "episodes": None}, 0),
+        (None, 0),
+    ],
+)
+def test_validating_on_episodes_that_were_trained_on_says_so(doorkey_root, tiny_policy, tmp_path, trained_on, seen):
+    tiny_policy().save_pretrained(tmp_path)
+    if trained_on is not None:
+        place = {"here": str(doorkey_root), "elsewhere": str(tmp_path)}.get(trained_on["root"])
+        settings = {"seed": 0, "batch_size": 1, "steps": 1, "policy": {}, "dataset": {**trained_on, "root": place}}
+        (tmp_path / "train_config.json").write_text(json.dumps(settings))
+    policy = UniMASKPolicy.from_pretrained(tmp_path)
+    assert len(episodes_trained_on(policy.folder, doorkey_root, "local/dataset", 30)) == seen
+
+
+def test_the_record_says_how_many_episodes_were_trained_on(runs) -> None:
+    folders, _ = runs
+    data = json.loads((last_checkpoint(folders[0]) / "train_config.json").read_text())["dataset"]
+    (result,) = validate([last_checkpoint(folders[0])], Path(data["root"]))["runs"]
+    assert result["trained_on_episodes"] == LeRobotDatasetMetadata("local/data", root=data["root"]).total_episodes
 
 
 def test_one_checkpoint_can_be_validated_by_itself(runs) -> None:

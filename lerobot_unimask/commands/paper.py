@@ -154,7 +154,7 @@ def _questions(arguments: argparse.Namespace) -> None:
     settings = {"each": arguments.each, "samples": arguments.samples, "seed": arguments.seed, "expert": expert}
     record = ask_everything(policy, first_windows(dataset), **settings)
     record["policy"] = policy.describe_origin()
-    record["training"] = training_settings(Path(policy.origin.repository))
+    record["training"] = training_settings(policy.folder)
     print(summary(record))
     if arguments.output:
         write_json(arguments.output, {**record, "command": arguments.text})

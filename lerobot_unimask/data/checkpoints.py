@@ -77,12 +77,18 @@ def training_settings(checkpoint: str | Path) -> dict[str, Any] | None:
     return {**{key: config[key] for key in keep}, "policy": policy, "data": provenance}
 
 
-def was_trained_on(checkpoint: str | Path, root: Path, repo_id: str | None) -> bool:
-    """Whether a checkpoint's training read this dataset, by its folder or its name on the Hub."""
-    data = (_train_config(checkpoint) or {}).get("dataset") or {}
+def episodes_trained_on(checkpoint: str | Path | None, root: Path, repo_id: str | None, count: int) -> list[int]:
+    """The episodes, of a dataset's `count`, that a checkpoint's training read: none where it read another dataset, by
+    its folder or its name on the Hub, or where that is not known."""
+    data = (_train_config(checkpoint) or {}).get("dataset") if checkpoint else None
+    if not data:
+        return []
     if data.get("root"):
-        return Path(data["root"]).resolve() == root.resolve()
-    return repo_id is not None and data.get("repo_id") == repo_id
+        same = Path(data["root"]).resolve() == root.resolve()
+    else:
+        same = repo_id is not None and data.get("repo_id") == repo_id
+    episodes = data.get("episodes")
+    return (list(range(count)) if episodes is None else sorted(set(episodes) & set(range(count)))) if same else []
 
 
 def check_header(file: Path, expected: Mapping[str, Tensor]) -> None:
