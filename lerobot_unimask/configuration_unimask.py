@@ -343,4 +343,4 @@ def read_config(folder: Path) -> UniMASKConfig:
     except (ParsingError, ValueError, AttributeError) as error:
         hidden = isinstance(error, ParsingError) and not isinstance(error, DecodingError)
         reason = error.__cause__ if hidden else error
-        raise ValueError(f"{path} cannot be read: {reason}") from error
+        raise ValueError(f"{path} cannot be read: {str(reason)[:1000]}") from error

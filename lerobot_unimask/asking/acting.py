@@ -23,7 +23,7 @@ from lerobot_unimask.asking.given import (
     give,
     in_window,
     read_given,
-    shown,
+    text_of,
 )
 from lerobot_unimask.asking.memory import NO_RETURN_SO_FAR, RolloutMemory
 from lerobot_unimask.asking.sampling import sample as draw_jointly
@@ -269,7 +269,7 @@ def observed_return(model: ActingModel, batch: Mapping[str, Any], batch_size: in
         return None
     received = as_tensor(repr(RETURN_SO_FAR), value).float().reshape(-1)
     if len(received) != batch_size or not received.isfinite().all():
-        raise ValueError(f"{RETURN_SO_FAR!r} is {shown(value)}; {batch_size} finite numbers are awaited, (B, 1).")
+        raise ValueError(f"{RETURN_SO_FAR!r} is {text_of(value)}; {batch_size} finite numbers are awaited, (B, 1).")
     return received.to(model.device)
 
 

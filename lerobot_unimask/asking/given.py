@@ -31,11 +31,11 @@ def read_given(
         ValueError: a value of the wrong size, not finite, or not one of the categories.
     """
     if not isinstance(given, Mapping):
-        raise ValueError(f'given is {shown(given)}; give values by token, as in {{"s[-1]": [15, 15], "rtg[0]": 5}}.')
+        raise ValueError(f'given is {text_of(given)}; give values by token, as in {{"s[-1]": [15, 15], "rtg[0]": 5}}.')
     tokens: dict[Token, Tensor] = {}
     for text, value in given.items():
         if not isinstance(text, str):
-            raise ValueError(f"given names {shown(text)}; name a token by its text, as in 's[-1]'.")
+            raise ValueError(f"given names {text_of(text)}; name a token by its text, as in 's[-1]'.")
         token = parse_token(text, tuple(factors), context_length)
         if token in tokens:
             raise ValueError(f"{token} is given twice, the second time as {text}.")
@@ -92,19 +92,19 @@ def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
     try:
         token = as_tensor(text, value).float()
     except ValueError as error:
-        raise ValueError(f"{text} is given {shown(value)}; give {numbers}.") from error
+        raise ValueError(f"{text} is given {text_of(value)}; give {numbers}.") from error
     if token.ndim == 0 or (token.ndim == 1 and size == 1 and token.shape[0] in (B or token.shape[0], 1)):
         token = token.reshape(-1, 1)
     elif token.ndim == 1:
         token = token.unsqueeze(0)
     if token.ndim != 2 or token.shape[1] != size or token.shape[0] not in (1, B or token.shape[0]):
         each = "each window or environment" if B is None else f"each of the {B} windows or environments"
-        raise ValueError(f"{text} is given {shown(value)}; give {numbers}, or one such row for {each}.")
-    check_values(f"{text} is given {shown(value)}, which", token, factor)
+        raise ValueError(f"{text} is given {text_of(value)}; give {numbers}, or one such row for {each}.")
+    check_values(f"{text} is given {text_of(value)}, which", token, factor)
     return token
 
 
-def shown(value: Any) -> str:
+def text_of(value: Any) -> str:
     """A value of any size in a few words, for an error."""
     if isinstance(value, Tensor) and (value.is_meta or value.layout != torch.strided):
         return f"a tensor of {value.dtype}, {value.layout}, on {value.device}"

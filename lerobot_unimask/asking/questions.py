@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from lerobot_unimask.asking.acting import ActingModel
-from lerobot_unimask.asking.given import Given, check_known, check_shown, check_values, give, in_window, read_given
+from lerobot_unimask.asking.given import (
+    Given,
+    check_known,
+    check_shown,
+    check_values,
+    give,
+    in_window,
+    read_given,
+    text_of,
+)
 from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import Mask, tabulate
@@ -28,7 +37,7 @@ def pose_question(
     K = model.config.context_length
     recorded = window is not None
     if window is None:
-        rows = (len(token) for token in read_given(given or {}, model.factors, K).values())
+        rows = (len(token) for token in read_given({} if given is None else given, model.factors, K).values())
         empty = RolloutMemory(model.factors, K, max(rows, default=1), model.device)
         window = empty.window(model.statistics.horizon)
         empty.carry_return(window)
@@ -46,7 +55,7 @@ def pose_question(
         table = tabulate(mask, tuple(model.factors), K)
         text, mask = table.question.text, table.at(None if t is None else step_number(t), batch_size)
     mask = mask.to(model.device).within(window.valid)
-    tokens = read_given(given or {}, model.factors, K, batch_size)
+    tokens = read_given({} if given is None else given, model.factors, K, batch_size)
     for token in tokens:
         if token.of_episode:
             raise ValueError(f"{token} is a moment of an episode, for rollouts; here name one of the window, s[3].")
@@ -72,4 +81,4 @@ def step_number(t: Any) -> int:
     try:
         return operator.index(t)
     except TypeError as error:
-        raise ValueError(f"t is {t!r}; give the number of a step, as in t=3.") from error
+        raise ValueError(f"t is {text_of(t)}; give the number of a step, as in t=3.") from error

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_unimask.asking.answers import Model, answer
-from lerobot_unimask.asking.given import shown
+from lerobot_unimask.asking.given import text_of
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE, Mask
 
@@ -73,7 +73,7 @@ def sample(
         RejectionError: one that every start of some sample fails.
     """
     if order not in ORDERS:
-        raise ValueError(f"order is {order!r}; choose one of {', '.join(ORDERS)}.")
+        raise ValueError(f"order is {text_of(order)}; choose one of {', '.join(ORDERS)}.")
     check_count(tries, "tries")
     asked = torch.stack([mask.asked[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
     tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
@@ -143,7 +143,7 @@ def check_count(count: int, name: str = "samples") -> int:
         ValueError: not a whole number of at least 1.
     """
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"{name} is {count!r}; give a whole number of at least 1.")
+        raise ValueError(f"{name} is {text_of(count)}; give a whole number of at least 1.")
     return count
 
 
@@ -153,5 +153,5 @@ def make_generator(seed: int, device: torch.device) -> torch.Generator:
         ValueError: a seed that torch does not take.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise ValueError(f"seed is {shown(seed)}; give a whole number from 0 to 2^63 - 1.")
+        raise ValueError(f"seed is {text_of(seed)}; give a whole number from 0 to 2^63 - 1.")
     return torch.Generator(device).manual_seed(seed)
