@@ -97,15 +97,15 @@ def act_in_real_time(
     states = np.stack([env.reset(seed=seed + i)[0]["agent_pos"] for i, env in enumerate(environments)])
     returns, actions, seams = np.zeros(episodes), [], []
     planned = _ask(policy, states, 0, None)
-    asked, asked_at = planned, -delay  # the first chunk is waited for
+    asked, asked_at = None, 0  # the first chunk is waited for
     for step in range(Maze2DEnv._max_episode_steps):
-        if step - asked_at == delay > 0:
-            planned = asked[:, delay:]
+        if asked is not None and step - asked_at == delay:
+            planned, asked = asked[:, delay:], None
             seams.append(step - 1)
         if step - asked_at >= max(AGAIN, delay):
             asked, asked_at = _ask(policy, states, delay, planned if prefix else None), step
             if delay == 0:
-                planned = asked
+                planned, asked = asked, None
                 seams.append(step - 1)
         action, planned = planned[:, 0], planned[:, 1:]
         actions.append(action)
