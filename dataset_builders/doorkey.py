@@ -15,7 +15,7 @@ from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, ENV_ID, FPS, HORI
 
 CHUNK = 10_000  # episodes rolled out at a time
 
-FEATURES = {
+FEATURES: dict[str, dict[str, Any]] = {
     OBS_STATE: {
         "dtype": "int64",
         "shape": (2,),

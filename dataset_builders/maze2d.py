@@ -11,6 +11,7 @@ import math
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -21,7 +22,7 @@ from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, _clip
 from lerobot_unimask.envs.maze2d.maze import ENV_ID, FPS, HORIZON, TASK
 
-FEATURES = {
+FEATURES: dict[str, dict[str, Any]] = {
     "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
     "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": ["return_to_go"]},
     "action": {"dtype": "float32", "shape": (2,), "names": ["force_x", "force_y"]},
@@ -185,7 +186,7 @@ def _statistics_seconds(columns: dict[str, np.ndarray]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=measure_build.__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(measure_build.__doc__ or "").splitlines()[0])
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=3)
     print(json.dumps(measure_build(**vars(parser.parse_args())), indent=4))

@@ -47,7 +47,8 @@ def build_metaworld(
     if episodes < 1 or seed < 0 or not noise >= 0:
         raise ValueError(f"episodes is {episodes}, seed {seed}, noise {noise}; the least are 1, 0 and 0.")
     env, expert, rng = MetaWorldEnv(task, render_mode=None), make_expert(task), np.random.default_rng(seed)
-    found, failures = [], 0
+    found: list[Any] = []
+    failures = 0
     with tqdm(total=episodes, desc=f"Demonstrating {task}", disable=None if progress else True) as bar:
         while len(found) < episodes:
             demonstration = demonstrate(env, expert, noise, rng)

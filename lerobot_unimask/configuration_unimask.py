@@ -42,6 +42,7 @@ NETWORKS = {
 }
 TOKEN_LAYOUTS = ("stacked", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
+UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
 # More is a damaged file, or a slip
 MOST = {"width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
 
@@ -174,9 +175,7 @@ class UniMASKConfig(PreTrainedConfig):
     format_version: FormatVersion = FORMAT_VERSION
     """Format of a checkpoint's files."""
 
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
-    )
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=UNCHANGED.copy)
     """LeRobot's processors leave the numbers alone: the policy normalises, with statistics that it keeps itself."""
 
     def __post_init__(self) -> None:

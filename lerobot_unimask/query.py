@@ -145,8 +145,8 @@ def ask(
         windows = len(answer.mask.shown["s"])
     else:
         check = make_check(policy, sampling.check, start) if sampling.check else None
-        settings = {"samples": sampling.samples, "order": sampling.order, "seed": sampling.seed, "check": check}
-        answer = policy.sample(recorded, mask, t=t, given=given, **settings)
+        n, order, seed = sampling.samples, sampling.order, sampling.seed
+        answer = policy.sample(recorded, mask, t=t, given=given, samples=n, order=order, seed=seed, check=check)
         windows = len(answer.valid) // sampling.samples
     if windows > 1:
         raise ValueError(f"Values for {windows} windows are given; give one value for each token.")

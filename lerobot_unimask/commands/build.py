@@ -1,6 +1,7 @@
 """`unimask build`: a dataset of an environment's expert."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,11 @@ def _build(arguments: argparse.Namespace) -> None:
     from dataset_builders.maze2d import build_maze2d
     from dataset_builders.metaworld import build_metaworld
 
-    builders = {"doorkey": build_doorkey, "maze2d": build_maze2d, "metaworld": build_metaworld}
+    builders: dict[str, Callable[..., Path]] = {
+        "doorkey": build_doorkey,
+        "maze2d": build_maze2d,
+        "metaworld": build_metaworld,
+    }
     build = builders[arguments.environment]
     settings = {name: getattr(arguments, name) for name in ("episodes", "seed", "repo_id", *arguments.settings)}
     root = build(arguments.root, **settings)

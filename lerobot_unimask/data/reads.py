@@ -13,6 +13,7 @@ import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import datasets
@@ -45,7 +46,7 @@ class Windows(Sequence):
     def __len__(self) -> int:
         return self.length
 
-    def __getitem__(self, i: int | slice) -> Item | list[Item]:
+    def __getitem__(self, i: Any) -> Any:
         if isinstance(i, slice):
             return [self[j] for j in range(*i.indices(self.length))]
         i = range(self.length)[i]
@@ -194,7 +195,7 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
                 )
         steps[deltas] = taken, columns.pieces_of(taken), wanted != absolute
 
-    batch = {}
+    batch: dict[str, Any] = {}
     for key, column in columns.columns.items():
         where = steps[deltas_of[key]][:2] if key in deltas_of else (rows, pieces)
         batch[key] = torch.from_numpy(column.take(*where)).to(column.dtype)

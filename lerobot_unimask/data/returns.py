@@ -45,6 +45,9 @@ class EpisodeStarts(nn.Module):
     `states` is (E, D), `returns` (E,), both in the dataset's units.
     """
 
+    states: Tensor
+    returns: Tensor
+
     def __init__(self, size: int):
         super().__init__()
         self.register_buffer("states", torch.zeros(0, size))

@@ -87,7 +87,7 @@ class _Parser:
                 raise MaskError(
                     f"Unexpected character {text[at]!r}; a mask text looks like 'a[t] | s[:t+1], a[:t]'.", text, at
                 )
-            kind = match.lastgroup
+            kind = str(match.lastgroup)
             self.tokens.append((kind, match[kind], match.start(kind)))
             at = match.end()
         self.tokens.append(("end", "", end))
@@ -107,7 +107,7 @@ class _Parser:
 
     def question(self) -> Question:
         asked = self.terms()
-        shown = ()
+        shown: tuple[Term, ...] = ()
         if self.accept("|") and self.tokens[self.next][0] != "end":
             shown = self.terms()
         if self.tokens[self.next][0] != "end":

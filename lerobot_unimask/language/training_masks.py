@@ -37,6 +37,16 @@ class TrainingMasks(nn.Module):
         ValueError: no masks, or weights that are not positive numbers.
     """
 
+    shown: Tensor
+    asked: Tensor
+    task_of_row: Tensor
+    askable: Tensor
+    cumulative_weights: Tensor
+    causal_shown: Tensor
+    causal_asked: Tensor
+    causal_row: Tensor
+    causal_cumulative_weights: Tensor
+
     def __init__(
         self,
         masks: str | Sequence[str] | Mapping[str, float],
@@ -139,8 +149,10 @@ class TrainingMasks(nn.Module):
                 history = history & (self.askable | ~hidden | (task != self.random_task)[:, None, None])
             shown = torch.where(causal[:, None, None], history, shown)
             asked = torch.where(causal[:, None, None], self.causal_asked[task], asked)
-        shown, asked = (dict(zip(self.factors, tokens.unbind(1), strict=True)) for tokens in (shown, asked))
-        return Mask(shown, asked, causal).within(valid)
+        return Mask(self._by_factor(shown), self._by_factor(asked), causal).within(valid)
+
+    def _by_factor(self, tokens: Tensor) -> dict[str, Tensor]:
+        return dict(zip(self.factors, tokens.unbind(1), strict=True))
 
     def _question_masks(self, valid: Tensor, task: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """One row per window, uniform among those of its task that ask for something valid: two (B, F, K)."""
@@ -203,7 +215,7 @@ def mixture(masks: str | Sequence[str] | Mapping[str, float], factors: Sequence[
             raise ValueError(f"training_masks gives {text!r} the weight {weight!r}; weights are positive numbers.")
         members = REGIMES.get(text, (text,))
         if text in REGIMES and factors is not None:
-            members = [member for member in members if {term.factor for term in parse(member).terms} <= set(factors)]
+            members = tuple(m for m in members if {term.factor for term in parse(m).terms} <= set(factors))
         for member in members:
             expanded[member] = expanded.get(member, 0.0) + weight / len(members)
     return expanded

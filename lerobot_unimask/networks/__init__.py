@@ -1,5 +1,7 @@
 """The networks: (window, shown) -> predictions, one file each, chosen by `--policy.network=...`."""
 
+from typing import Any
+
 from torch import nn
 
 from lerobot_unimask.configuration_unimask import UniMASKConfig
@@ -15,7 +17,7 @@ def make_network(config: UniMASKConfig, factors: dict[str, Factor]) -> nn.Module
     Raises:
         ValueError: the network needs a factor that is not there.
     """
-    shared = {
+    shared: dict[str, Any] = {
         "context_length": config.context_length,
         "fine_inputs": config.fine_inputs,
         "width": config.width,
@@ -36,3 +38,5 @@ def make_network(config: UniMASKConfig, factors: dict[str, Factor]) -> nn.Module
             return FeedForward(factors, **shared)
         case "decision_transformer":
             return DecisionTransformer(factors, heads=config.heads, **shared)
+        case other:
+            raise ValueError(f"There is no network {other!r}.")

@@ -28,6 +28,9 @@ class NumberEncoding(nn.Module):
         fine: False leaves the numbers alone, as the paper has them.
     """
 
+    frequencies: Tensor
+    scales: Tensor
+
     def __init__(self, size: int, *, fine: bool):
         super().__init__()
         self.fine = fine
@@ -104,7 +107,7 @@ class FactorEmbedding(nn.Module):
 
     def __init__(self, factor: Factor, width: int, *, fine_inputs: bool):
         super().__init__()
-        self.discrete = {c.dims.start: c.categories for c in factor.components if c.discrete}
+        self.discrete = {c.dims.start: c.categories for c in factor.components if c.categories is not None}
         self.continuous = [c.dims for c in factor.components if not c.discrete]
         self.categories = nn.ModuleList(nn.Embedding(count, width) for count in self.discrete.values())
         if self.continuous:

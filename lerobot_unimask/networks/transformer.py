@@ -110,7 +110,7 @@ class Transformer(nn.Module):
 
     def _extend(self, x: Tensor, count: int, cache: Cache) -> Tensor:
         """The last of the first `count` tokens of (B, N, W), from those alone that the cache lacks; elsewhere 0."""
-        if not cache.matches(x[:, :count]) or cache.inputs.shape[1] == count:
+        if cache.inputs is None or not cache.matches(x[:, :count]) or cache.inputs.shape[1] == count:
             cache.inputs, cache.keys, cache.values = None, [], []
         start = 0 if cache.inputs is None else cache.inputs.shape[1]
         attend = _before_or_here(count, x.device)[start:]
@@ -125,8 +125,8 @@ class Transformer(nn.Module):
     def _count(self, shown: dict[str, Tensor]) -> int:
         """Tokens up to the last state or action that is shown in some window."""
         steps = torch.stack([shown[name].any(0) for name in ASKABLE], dim=1).flatten()  # (2 K,)
-        shown = steps.nonzero()
-        return len(self.properties) + (int(shown[-1]) + 1 if len(shown) else 0)
+        numbers = steps.nonzero()
+        return len(self.properties) + (int(numbers[-1]) + 1 if len(numbers) else 0)
 
     def _stack(self, tokens: dict[str, Tensor]) -> Tensor:
         return self.stack(torch.cat(list(tokens.values()), dim=-1))  # (B, K, F W) -> (B, K, W)

@@ -44,7 +44,7 @@ def cost_of_context(record: Mapping[str, Any]) -> Figure:
         record: As `experiments.ablation` makes it, of several context lengths.
     """
     figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
-    panels = {
+    panels: dict[str, dict[str, str | None]] = {
         "mean return": {"behavior_cloning": "imitation", "reward_conditioned": "reward-conditioned"},
         "processor time per update (ms)": {"ms_per_update": None},
         "time per action (ms)": {"latency_ms": None},

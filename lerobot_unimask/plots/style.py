@@ -1,5 +1,7 @@
 """What all pictures share: colours, sizes, and how a token of a mask is drawn."""
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,9 +24,9 @@ TIME = LinearSegmentedColormap.from_list("time", matplotlib.colormaps["viridis"]
 LEAST = 0.01  # probabilities below this are not drawn
 
 # How a token of a mask is drawn
-SHOWN = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 1.2}
-ASKED = {"facecolor": "#FBE9DD", "edgecolor": VERMILLION, "linewidth": 1.2}
-HIDDEN = {"facecolor": "#F2F2F2", "edgecolor": "#CFCFCF", "linewidth": 0.6}
+SHOWN: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 1.2}
+ASKED: dict[str, Any] = {"facecolor": "#FBE9DD", "edgecolor": VERMILLION, "linewidth": 1.2}
+HIDDEN: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#CFCFCF", "linewidth": 0.6}
 
 
 def time_colours(steps: int) -> ScalarMappable:

@@ -57,7 +57,7 @@ def fetch(repo_id: str, *, revision: str | None = None, **download: Any) -> Path
     """
     with pull_errors(repo_id, revision):
         # The processors too: LeRobot's commands read them later, and may be offline then.
-        patterns = {"allow_patterns": ["*.json", "*.safetensors"], "ignore_patterns": ["*/*"]}
+        patterns: dict[str, Any] = {"allow_patterns": ["*.json", "*.safetensors"], "ignore_patterns": ["*/*"]}
         folder = Path(snapshot_download(repo_id, revision=revision, **patterns, **download))
         for name in (CONFIG_NAME, SAFETENSORS_SINGLE_FILE):
             if not (folder / name).exists():
@@ -246,10 +246,10 @@ def _push(
             operations += [CommitOperationDelete(path) for path in there if path not in {*files, ".gitattributes"}]
         commit = api.create_commit(repo_id, operations, commit_message=message, repo_type=kind, parent_commit=head)
     if tag is not None:
-        there = (
+        whole = (
             f"its {len(files)} files are there, in commit {commit.oid[:8]}, but not the tag {tag}, which LeRobot reads"
         )
-        with _push_errors(repo_id, again, there):
+        with _push_errors(repo_id, again, whole):
             _set_tag(api, repo_id, kind, tag, commit.oid)
     return url.url
 

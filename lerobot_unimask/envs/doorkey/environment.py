@@ -133,7 +133,7 @@ class DoorKeyEnv(gym.Env):
         """
         super().reset(seed=seed)
         self._grid.place(*self._start_cells(options or {}))
-        self._steps, self._return, self._reached_goal = 0, 0, False
+        self._steps, self._return, self._reached_goal = 0, 0.0, False
         return self._observation(), {"is_success": False}
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
@@ -178,7 +178,7 @@ class DoorKeyEnv(gym.Env):
 
 def _as_action(action: Any) -> int:
     try:
-        number = np.rint(np.asarray(action, dtype=np.float64).reshape(()))
+        number = float(np.rint(np.asarray(action, dtype=np.float64).reshape(())))
     except (TypeError, ValueError):  # no number, or more than one
         number = np.nan
     if not 0 <= number < len(ACTIONS):  # NaN too

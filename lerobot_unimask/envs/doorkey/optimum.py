@@ -94,8 +94,8 @@ class Optimum:
         parts = []
         for first in range(0, B, _CHUNK):
             chunk = slice(first, first + _CHUNK)
-            these = ({name: tensor[chunk] for name, tensor in part.items()} for part in (values, shown))
-            parts.append(self._marginals(*these, K, first))
+            these, seen = ({name: tensor[chunk] for name, tensor in part.items()} for part in (values, shown))
+            parts.append(self._marginals(these, seen, K, first))
         agent, key, action = (
             torch.cat(part).log().clamp_min(_LOG_ZERO).to(device) for part in zip(*parts, strict=True)
         )

@@ -15,8 +15,11 @@ A cell is numbered 4 (y - 1) + (x - 1). A state is (agent cell, key cell, door o
 is, and stepping on the key picks it up, so the agent carries it exactly when the two cells are equal.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 ENV_ID = "lerobot_unimask/DoorKey-v0"
 
@@ -35,13 +38,13 @@ _WALL_X = 3  # the inner wall's column, which the door is in
 _DX, _DY = np.array([1, 0, -1, 0]), np.array([0, 1, 0, -1])  # of each action; y grows downwards
 
 
-def coordinates(cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def coordinates(cell: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """(x, y), each 1 to 4, of cells 0 to 15; any shape."""
     cell = np.asarray(cell)
     return cell % _SIZE + 1, cell // _SIZE + 1
 
 
-def cell_at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def cell_at(x: ArrayLike, y: ArrayLike) -> np.ndarray:
     """The cell, 0 to 15, at (x, y), each 1 to 4; any shape."""
     return _SIZE * (np.asarray(y) - 1) + np.asarray(x) - 1
 
@@ -57,7 +60,7 @@ START_PAIRS = np.array([(agent, key) for agent in START_CELLS for key in START_C
 
 
 def step(
-    agent: np.ndarray, key: np.ndarray, door_open: np.ndarray, action: np.ndarray
+    agent: ArrayLike, key: ArrayLike, door_open: ArrayLike, action: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The next state's (agent, key, door_open). The arguments, and the results, broadcast against each other."""
     agent, key, door_open, action = np.broadcast_arrays(agent, key, door_open, action)
@@ -72,14 +75,14 @@ def step(
     return next_agent, next_key, door_open | (next_agent == DOOR)
 
 
-def distance_to_goal(agent: np.ndarray) -> np.ndarray:
+def distance_to_goal(agent: ArrayLike) -> np.ndarray:
     """Steps of the walk from these cells through the door to the goal; any shape."""
     x, y = coordinates(agent)
     through_door = np.abs(x - (_WALL_X - 1)) + np.abs(y - 1) + 1 + 4
     return np.where(x < _WALL_X, through_door, np.abs(x - _SIZE) + np.abs(y - _SIZE))
 
 
-def reward(agent: np.ndarray, next_agent: np.ndarray) -> np.ndarray:
+def reward(agent: ArrayLike, next_agent: ArrayLike) -> np.ndarray:
     """By how much the step brought the agent closer to the goal: 1, 0 or -1."""
     return distance_to_goal(agent) - distance_to_goal(next_agent)
 
@@ -109,14 +112,14 @@ class DynamicsCheck:
         for _ in range(first_step):
             self._first = self._image(self._first[None], np.ones((1, len(ACTIONS)), dtype=bool))[0]
 
-    def __call__(self, values: dict[str, torch.Tensor], decided: dict[str, torch.Tensor]) -> torch.Tensor:
+    def __call__(self, values: Mapping[str, torch.Tensor], decided: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """(N,) bool, from `s` (N, K, 2) and `a` (N, K, 1), and which of them are decided, (N, K) each."""
         cells = values["s"].nan_to_num(0).long().numpy(force=True)
         states = _possible(self._number[cells[..., 0], cells[..., 1]], decided["s"], len(self._following))  # (N, K, 69)
         taken = values["a"][..., 0].nan_to_num(0).long().numpy(force=True)
         actions = _possible(taken, decided["a"], len(ACTIONS))  # (N, K, 4)
         before = states[:, 0] & self._first if self.agree else states[:, 0]
-        fine = before.any(axis=1) & states.any(axis=-1).all(axis=1)  # (N,)
+        fine = before.any(axis=1) & np.all(states.any(axis=-1), axis=1)  # (N,)
         for k in range(states.shape[1] - 1):
             after = self._image(before, actions[:, k]) & states[:, k + 1]
             fine &= after.any(axis=1)

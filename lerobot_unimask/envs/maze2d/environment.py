@@ -14,6 +14,7 @@ from functools import lru_cache
 import gymnasium as gym
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lerobot_unimask.envs.maze2d.maze import (
     BODY_OFFSET,
@@ -141,7 +142,7 @@ class Maze2DEnv(gym.Env):
         mujoco.mj_resetData(self._model, self._data)  # time and the solver's warm start too
         self._data.qpos[:] = position
         self._data.qvel[:] = velocity
-        self._trail = [tuple(position)]
+        self._trail = [(position[0], position[1])]
         self._distance = self._start_distance = math.dist(position, self._goal)
         self._is_success = self._distance <= SUCCESS_DISTANCE
         return self._observation(), {"is_success": self._is_success}
@@ -156,7 +157,8 @@ class Maze2DEnv(gym.Env):
         control[0], control[1] = action_x, action_y  # the motors' control range clips them
         mujoco.mj_step(self._model, data)
 
-        position = tuple(data.qpos.tolist())
+        x, y = data.qpos.tolist()
+        position = (x, y)
         self._trail.append(position)
         distance = math.dist(position, self._goal)
         reward = self._distance - distance
@@ -199,11 +201,11 @@ class Maze2DEnv(gym.Env):
         return [x, y]
 
 
-def _two_numbers(name: str, values: Sequence[float]) -> list[float]:
+def _two_numbers(name: str, values: ArrayLike) -> tuple[float, float]:
     numbers = np.asarray(values, np.float64)
     if numbers.shape != (2,):
         raise ValueError(f"The {name} must be two numbers, its shape is {numbers.shape}.")
     first, second = pair = numbers.tolist()
     if not (math.isfinite(first) and math.isfinite(second)):
         raise ValueError(f"The {name} must be finite, it is {pair}.")
-    return pair
+    return first, second
