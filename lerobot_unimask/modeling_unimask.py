@@ -129,7 +129,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         step = self.updates if self.training else VALIDATION_STEP
         mask = self.training_masks(window.valid, frame_index(batch, window), seed=self.config.mask_seed, step=step)
         window = self.statistics.normalise(window)
-        predictions = self.network(window, mask.shown, mask.causal)
+        predictions = self.network(window, mask.shown, mask.causal, asked=mask.asked)
         losses = masked_losses(predictions, window, mask.asked, self.factors, reduction=reduction)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
         return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
@@ -168,7 +168,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """
         causally = self.training_masks.answered_causally(mask)
         if all(torch.equal(causally[name], mask.asked[name]) for name in causally):
-            return self.network(window, mask.shown, True, cache)
+            return self.network(window, mask.shown, True, cache, mask.asked)
         if self.config.attention == "causal":
             raise MaskError(
                 "This model attends causally alone. It was trained on "
@@ -176,9 +176,9 @@ class UniMASKPolicy(PreTrainedPolicy):
                 "it. A model of attention=both answers any question.",
                 mask.draw(),
             )
-        predictions = self.network(window, mask.shown, False)
+        predictions = self.network(window, mask.shown, False, asked=mask.asked)
         if any(tokens.any() for tokens in causally.values()):
-            for name, outputs in self.network(window, mask.shown, True).items():
+            for name, outputs in self.network(window, mask.shown, True, asked=causally).items():
                 here = causally[name].unsqueeze(-1)
                 pairs = zip(outputs, predictions[name], strict=True)
                 predictions[name] = [torch.where(here, causal, other) for causal, other in pairs]

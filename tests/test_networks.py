@@ -8,7 +8,7 @@ import torch
 from lerobot_unimask.data.factors import Feature, make_factors
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.networks.feedforward import FeedForward
-from lerobot_unimask.networks.layers import Cache, NumberEncoding, course
+from lerobot_unimask.networks.layers import Block, Cache, Dropout, NumberEncoding, course
 from lerobot_unimask.networks.losses import masked_losses
 from lerobot_unimask.networks.transformer import Transformer
 
@@ -340,3 +340,53 @@ def test_mixed_precision_answers_in_full_precision(kind):
         mixed = flat(network(window, shown))
     assert mixed.dtype == torch.float32
     torch.testing.assert_close(mixed, flat(network(window, shown)), rtol=0.1, atol=0.05)
+
+
+@pytest.mark.parametrize("causal", [False, True, torch.tensor([True, False, True])], ids=["both", "causal", "mixed"])
+@pytest.mark.parametrize("dropout", [0.0, 0.3])
+def test_what_is_asked_alone_is_answered_and_learnt_as_with_all_the_rest(kind, causal, dropout):
+    network, factors = make_network(kind, "separate", dropout)
+    window, shown = random_window(factors), random_shown(factors)
+    asked = {name: ~tokens for name, tokens in shown.items()}
+    gradients, answers = [], []
+    for some in (None, asked):
+        outputs = network(window, shown, causal, asked=some)
+        answers.append({name: [o[asked[name]] for o in outputs[name]] for name in ("s", "a")})
+        network.zero_grad()
+        sum(o.square().sum() for parts in answers[-1].values() for o in parts).backward()
+        gradients.append({name: p.grad for name, p in network.named_parameters() if p.grad is not None})
+    torch.testing.assert_close(answers[1], answers[0])
+    torch.testing.assert_close(gradients[1], gradients[0])
+
+
+def test_nothing_asked_costs_nothing(kind):
+    network, factors = make_network(kind, "separate")
+    window, shown = random_window(factors), random_shown(factors)
+    nothing = {name: torch.zeros_like(tokens) for name, tokens in shown.items()}
+    outputs = flat(network(window, shown, True, asked=nothing))
+    outputs.sum().backward()
+    assert all(p.grad is None or not p.grad.any() for p in network.parameters())
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_dropout_leaves_out_its_share_and_keeps_the_mean(share):
+    torch.manual_seed(0)
+    x = torch.ones(1001, 101, requires_grad=True)
+    dropped = Dropout(share)(x)
+    left_out = dropped == 0
+    assert left_out.double().mean().item() == pytest.approx(share, abs=0.01)
+    assert torch.allclose(dropped[~left_out], torch.tensor(1 / (1 - share)), rtol=1e-4)
+    neighbours = (left_out[:, 1:] & left_out[:, :-1]).double().mean().item()  # draws that share 64 bits are independent
+    assert neighbours == pytest.approx(share**2, abs=0.01)
+    dropped.sum().backward()
+    assert torch.equal(x.grad, dropped.detach())
+    assert torch.equal(Dropout(share).eval()(x), x)
+
+
+def test_attention_with_dropout_is_pytorchs_where_nothing_is_left_out():
+    block = Block(16, 2, 16, dropout=0.0)
+    query, key, value = torch.randn(3, 2, 2, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
+    attend = torch.ones(5, 5, dtype=torch.bool).tril()
+    expected = [block._attend(query, key, value, mask) for mask in (None, attend)]
+    block.dropout.p = 1e-9  # too small to leave anything out
+    torch.testing.assert_close([block._attend(query, key, value, mask) for mask in (None, attend)], expected)

@@ -10,7 +10,7 @@ from torch.nn import functional
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
-from lerobot_unimask.networks.layers import Block, Cache, FactorEmbedding, Heads, Predictions
+from lerobot_unimask.networks.layers import Block, Cache, Dropout, FactorEmbedding, Heads, Predictions
 
 # Rows of the timestep embedding, as in the original: an episode's steps, or thousandths of a longer one
 TIMESTEPS = 1000
@@ -65,7 +65,7 @@ class DecisionTransformer(nn.Module):
         self.timesteps = nn.Embedding(TIMESTEPS + 1, width)
         nn.init.normal_(self.timesteps.weight, std=0.02)
         self.norm_inputs = nn.LayerNorm(width)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.heads = Heads(factors, width)
@@ -73,7 +73,12 @@ class DecisionTransformer(nn.Module):
         self.register_buffer("before", before, persistent=False)
 
     def forward(
-        self, window: Window, shown: dict[str, Tensor], causal: Tensor | bool = True, cache: Cache | None = None
+        self,
+        window: Window,
+        shown: dict[str, Tensor],
+        causal: Tensor | bool = True,
+        cache: Cache | None = None,
+        asked: dict[str, Tensor] | None = None,
     ) -> Predictions:
         """As `Transformer.forward`, causally whatever `causal` says; it keeps nothing in a cache.
 

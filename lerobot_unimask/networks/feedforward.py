@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
-from lerobot_unimask.networks.layers import Cache, FactorEmbedding, Heads, Predictions
+from lerobot_unimask.networks.layers import Cache, Dropout, FactorEmbedding, Heads, Predictions
 
 
 class FeedForward(nn.Module):
@@ -49,14 +49,19 @@ class FeedForward(nn.Module):
         widths = [tokens * width] + depth * [feedforward_width]
         self.hidden = nn.Sequential(
             *(
-                nn.Sequential(nn.Linear(before, after), nn.GELU(), nn.Dropout(dropout))
+                nn.Sequential(nn.Linear(before, after), nn.GELU(), Dropout(dropout))
                 for before, after in pairwise(widths)
             )
         )
         self.heads = Heads(factors, feedforward_width, steps=context_length)
 
     def forward(
-        self, window: Window, shown: dict[str, Tensor], causal: Tensor | bool = False, cache: Cache | None = None
+        self,
+        window: Window,
+        shown: dict[str, Tensor],
+        causal: Tensor | bool = False,
+        cache: Cache | None = None,
+        asked: dict[str, Tensor] | None = None,
     ) -> Predictions:
         """As `Transformer.forward`; it sees the whole window whatever `causal` says, and keeps nothing in a cache."""
         tokens = {name: embed(window.values[name], shown[name]) for name, embed in self.embeddings.items()}

@@ -14,7 +14,16 @@ from torch.nn import functional
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
-from lerobot_unimask.networks.layers import Block, Cache, FactorEmbedding, Heads, Predictions, _before_or_here, course
+from lerobot_unimask.networks.layers import (
+    Block,
+    Cache,
+    Dropout,
+    FactorEmbedding,
+    Heads,
+    Predictions,
+    _before_or_here,
+    course,
+)
 
 
 class Transformer(nn.Module):
@@ -53,7 +62,7 @@ class Transformer(nn.Module):
             self.stack = nn.Linear(len(factors) * width, width)
         tokens = context_length if stacked else len(self.properties) + len(ASKABLE) * context_length
         self.positions = nn.Parameter(0.02 * torch.randn(tokens, width))  # within the window, not the episode
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.on_course = {
@@ -67,6 +76,7 @@ class Transformer(nn.Module):
         shown: dict[str, Tensor],
         causal: Tensor | bool = False,
         cache: Cache | None = None,
+        asked: dict[str, Tensor] | None = None,
     ) -> Predictions:
         """For every step, logits of discrete components, and of continuous ones normalised means, or means and the
         logarithms of scales.
@@ -78,16 +88,21 @@ class Transformer(nn.Module):
                 token is then made from the one before it, and does not depend on whether itself is shown.
             cache: of a rollout, with `causal=True`: only what it does not hold yet is computed, up to the last token
                 shown; only the prediction for the next one means something.
+            asked: factor -> (B, K) bool, True = asked: what is read of the predictions. On a processor the last block
+                and the heads compute nothing else. None: all.
         """
         tokens = {name: embed(window.values[name], shown[name]) for name, embed in self.embeddings.items()}
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
         x = self.dropout(x + self.positions)
-        x = self._attend(x, causal) if cache is None else self._extend(x, self._count(shown), cache)
-        x = self.norm(x)
-        if causal is not False:  # the token before; nothing stands before the first one
-            before = functional.pad(x, (0, 0, 1, -1))
-            x = before if causal is True else torch.where(causal[:, None, None], before, x)
-        predictions = self.heads(dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x))
+        if asked is not None and cache is None and not self.stacked and x.device.type == "cpu":
+            predictions = self._predict_asked(x, causal, asked)
+        else:
+            x = self._attend(x, causal) if cache is None else self._extend(x, self._count(shown), cache)
+            x = self.norm(x)
+            if causal is not False:  # the token before; nothing stands before the first one
+                before = functional.pad(x, (0, 0, 1, -1))
+                x = before if causal is True else torch.where(causal[:, None, None], before, x)
+            predictions = self.heads(dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x))
         if self.on_course:
             states = torch.where(shown["s"].unsqueeze(-1), window.values["s"], 0.0)
             ahead = course(states, shown["s"], causal)
@@ -97,16 +112,31 @@ class Transformer(nn.Module):
                 predictions["s"][i] = torch.cat([mean, output[..., dims.stop - dims.start :]], dim=-1)
         return predictions
 
-    def _attend(self, x: Tensor, causal: Tensor | bool) -> Tensor:
-        """All tokens, (B, N, W) -> (B, N, W)."""
+    def _predict_asked(self, x: Tensor, causal: Tensor | bool, asked: dict[str, Tensor]) -> Predictions:
+        """The asked tokens of (B, N, W); how many there are is known on a processor without waiting for it."""
+        B, N, _ = x.shape
+        earlier = (
+            int(causal) if isinstance(causal, bool) else causal.long()[:, None]
+        )  # 1: predicted from the one before
+        step = len(self.properties) + len(ASKABLE) * torch.arange(asked["s"].shape[1]) - earlier
+        position = [(step + i).expand(B, -1)[asked[name]] for i, name in enumerate(ASKABLE)]
+        window = [asked[name].nonzero()[:, 0] for name in ASKABLE]
+        sizes = [len(rows) for rows in position]
+        place = torch.cat(position)  # (M,) of what each asked token is predicted from, in its window; -1: nothing
+        x = self.norm(self._attend(x, causal, torch.cat(window) * N + place.clamp_min(0)))
+        x = torch.where((place >= 0).unsqueeze(-1), x, 0.0)
+        return self.heads(dict(zip(ASKABLE, x.split(sizes), strict=True)), asked)
+
+    def _attend(self, x: Tensor, causal: Tensor | bool, read: Tensor | None = None) -> Tensor:
+        """All tokens, (B, N, W) -> (B, N, W), or those whose numbers among the B N tokens are `read`: (M, W)."""
         attend = None
         if causal is not False:
             attend = _before_or_here(x.shape[1], x.device)  # (N, N)
             if causal is not True:
                 attend = attend | ~causal[:, None, None, None]  # (B, 1, N, N)
-        for block in self.blocks:
+        for block in self.blocks[:-1]:
             x, _ = block(x, attend, None)
-        return x
+        return self.blocks[-1](x, attend, None, read=read)[0]
 
     def _extend(self, x: Tensor, count: int, cache: Cache) -> Tensor:
         """The last of the first `count` tokens of (B, N, W), from those alone that the cache lacks; elsewhere 0."""
@@ -117,10 +147,11 @@ class Transformer(nn.Module):
         new = x[:, start:count]
         for depth, block in enumerate(self.blocks):
             past = (cache.keys[depth], cache.values[depth]) if start else None
-            new, kept = block(new, attend, past, last_alone=depth == len(self.blocks) - 1)
+            last = torch.arange(1, len(x) + 1, device=x.device) * new.shape[1] - 1
+            new, kept = block(new, attend, past, read=last if depth == len(self.blocks) - 1 else None)
             cache.keys[depth : depth + 1], cache.values[depth : depth + 1] = [kept[0]], [kept[1]]
         cache.inputs = x[:, :count]
-        return functional.pad(new, (0, 0, count - 1, x.shape[1] - count))
+        return functional.pad(new.unsqueeze(1), (0, 0, count - 1, x.shape[1] - count))
 
     def _count(self, shown: dict[str, Tensor]) -> int:
         """Tokens up to the last state or action that is shown in some window."""
