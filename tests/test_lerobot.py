@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import sys
 from pathlib import Path
 
@@ -55,6 +56,19 @@ def test_lerobot_train_trains_validates_evaluates_and_saves(trained: tuple[Path,
     policy = UniMASKPolicy.from_pretrained(run / "checkpoints/last/pretrained_model")
     assert int(policy.updates) == 4
     assert policy.config.features["s"][0].categories == [16, 16]
+
+
+def test_workers_change_no_loss(root: Path, tmp_path: Path) -> None:
+    """Windows are read in batches, so none are started: they would see another order from the second epoch on."""
+    flags = [*TRAIN, *dataset(root), "--steps=12", "--batch_size=8", "--log_freq=1", "--save_checkpoint=false"]
+    logs = [
+        commands.check("lerobot-train", *flags, f"--num_workers={n}", f"--output_dir=run{n}", cwd=tmp_path)
+        for n in (0, 2)
+    ]
+    without, beside = (re.findall(r" loss:(\S+) grdn:(\S+)", log) for log in logs)
+    assert len(without) == 12  # an epoch has five
+    assert beside == without
+    assert "num_workers=0" in logs[1]
 
 
 def test_lerobot_eval_with_other_questions(trained: tuple[Path, str], tmp_path: Path) -> None:
