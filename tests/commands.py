@@ -49,7 +49,10 @@ def run(script: str, *arguments: str, cwd: Path, env: Mapping[str, str] | None =
         sys.stderr.flush()
         child = os.fork()
         if child == 0:
+            os.setpgid(0, 0)
             os._exit(_be(main, [script, *arguments], cwd, env or {}, out, err))
+        with contextlib.suppress(OSError):  # both set it, so that it is set whoever comes first
+            os.setpgid(child, child)
         status = _wait(child, [script, *arguments])
         texts = []
         for file in (out, err):
@@ -96,11 +99,14 @@ def _be(main, words: list[str], cwd: Path, env: Mapping[str, str], out: io.TextI
 
 def _wait(child: int, words: list[str]) -> int:
     deadline = time.monotonic() + SECONDS
-    while time.monotonic() < deadline:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.02)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    raise TimeoutError(f"{' '.join(words)} takes longer than {SECONDS} s")
+    try:
+        while time.monotonic() < deadline:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.02)
+        raise TimeoutError(f"{' '.join(words)} takes longer than {SECONDS} s")
+    except BaseException:  # the test's interruption too: neither the command nor what it has started outlives it
+        os.killpg(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        raise

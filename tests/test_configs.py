@@ -25,8 +25,6 @@ TRAINING = [path for path in CONFIGS if "dataset" in yaml.safe_load((ROOT / path
 GRIDS = [path for path in CONFIGS if path not in TRAINING]
 GRID_OF = {"ablation": AblationConfig, "heatmap": HeatmapConfig, "search": SearchConfig, "table": TableConfig}
 
-training = pytest.mark.parametrize("path", TRAINING, ids=str)
-
 
 def opening(path: Path) -> list[str]:
     """The comment that a config opens with, without its hash signs."""
@@ -35,23 +33,29 @@ def opening(path: Path) -> list[str]:
     return [line.removeprefix("#").strip() for line in lines[:end]]
 
 
-def read(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> TrainPipelineConfig:
-    """As lerobot-train reads it, up to the point where it would load the dataset."""
+@pytest.fixture(scope="module", params=TRAINING, ids=str)
+def path(request: pytest.FixtureRequest) -> Path:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def config(path: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainPipelineConfig:
+    """As lerobot-train reads it, up to the point where it would load the dataset. Not to be written to."""
     register_third_party_plugins()
-    monkeypatch.chdir(tmp_path)  # the output folder must not be there
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={ROOT / path}"])
-    config = TrainPipelineConfig.from_pretrained(ROOT / path)
-    config.validate()
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(tmp_path_factory.mktemp("empty"))  # the output folder must not be there
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={ROOT / path}"])
+        config = TrainPipelineConfig.from_pretrained(ROOT / path)
+        config.validate()
     return config
 
 
-@training
-def test_it_opens_with_the_commands_that_use_it(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_it_opens_with_the_commands_that_use_it(path: Path, config: TrainPipelineConfig) -> None:
     lines = opening(path)
     assert f"uv run lerobot-train --config_path={path}" in lines
     (build,) = (line for line in lines if line.startswith("uv run unimask build "))
     arguments = make_parser().parse_args(shlex.split(build)[3:])
-    root = Path(read(path, monkeypatch, tmp_path).dataset.root)
+    root = Path(config.dataset.root)
     if "uv run unimask label " in "\n".join(lines):
         text = " ".join(line.removesuffix("\\") for line in lines[lines.index(build) + 1 :])
         label = make_parser().parse_args(shlex.split(text.partition("uv run ")[2].partition(" uv run ")[0])[1:])
@@ -61,9 +65,7 @@ def test_it_opens_with_the_commands_that_use_it(path: Path, monkeypatch: pytest.
         assert arguments.root == root
 
 
-@training
-def test_lerobot_reads_it_and_knows_each_setting(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    config = read(path, monkeypatch, tmp_path)
+def test_lerobot_reads_it_and_knows_each_setting(path: Path, config: TrainPipelineConfig) -> None:
     assert isinstance(config.policy, UniMASKConfig)
     assert not config.policy.push_to_hub
     assert config.num_workers == 0  # windows are read in batches, faster than a worker can pass them on
@@ -72,9 +74,8 @@ def test_lerobot_reads_it_and_knows_each_setting(path: Path, monkeypatch: pytest
     assert config.eval_steps == 0 or config.dataset.eval_split > 0
 
 
-@training
-def test_its_masks_fit_its_window(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    policy = read(path, monkeypatch, tmp_path).policy
+def test_its_masks_fit_its_window(config: TrainPipelineConfig) -> None:
+    policy = config.policy
     factors = ("s", "a", "rtg", *(name.removeprefix("observation.") for name in policy.properties))
     assert TrainingMasks(policy.training_masks, factors, policy.context_length).weights
     assert tabulate(policy.inference_mask, factors, policy.context_length).t.tolist() == list(

@@ -161,6 +161,7 @@ def test_dataloader_and_subset_read_in_batches(root, monkeypatch):
         assert_same(batch, want)
 
 
+@pytest.mark.slow  # the worker imports LeRobot
 def test_a_spawned_worker_reads_in_batches(root):
     """The worker imports nothing of this project but what the pickled dataset brings."""
     dataset = load(root, episodes=EPISODES)
