@@ -51,10 +51,10 @@ SHORT: dict[str, list[tuple[str, int, str]]] = {
         ("eval_steps", 2, "smaller"),
         ("env_eval_freq", 4, "smaller"),
         ("num_workers", 0, "always"),  # workers have their own test, and take half a minute to start
-        ("eval.n_episodes", 2, "always"),
-        ("eval.batch_size", 2, "always"),
+        ("eval.n_episodes", 1, "always"),
+        ("eval.batch_size", 1, "always"),
     ],
-    "lerobot-eval": [("eval.n_episodes", 2, "always"), ("eval.batch_size", 2, "always")],
+    "lerobot-eval": [("eval.n_episodes", 1, "always"), ("eval.batch_size", 1, "always")],
 }
 
 
@@ -286,7 +286,7 @@ def test_blocks_and_commands_are_found_with_their_lines() -> None:
         ("unimask measure --dataset.episodes=900:1000", "unimask measure --dataset.episodes=36:40"),
         (
             "lerobot-eval --policy.path=o/checkpoints/004000/pretrained_model --eval.n_episodes=100",
-            "lerobot-eval --policy.path=o/checkpoints/last/pretrained_model --eval.n_episodes=2 --eval.batch_size=2",
+            "lerobot-eval --policy.path=o/checkpoints/last/pretrained_model --eval.n_episodes=1 --eval.batch_size=1",
         ),
     ],
 )
