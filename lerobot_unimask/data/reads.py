@@ -1,16 +1,16 @@
 """Windows read in batches: LeRobotDataset's `__getitems__`, which PyTorch's DataLoader uses where a dataset has one.
 
-LeRobotDataset reads item by item, 7 to 11 ms for a window of ten steps. Here a batch of windows of a dataset without
-cameras is gathered by index from the columns, which stay in the files that `datasets` has memory-mapped; it is equal in
-keys, dtypes, shapes and values to the items read one by one and collated. `lerobot_patches.py` adds this to
-LeRobotDataset. Oracle: `tests/test_reads.py`.
+LeRobotDataset reads item by item, 7 to 11 ms for a window of ten steps. Here a batch of windows is gathered by index
+from the columns, which stay in the files that `datasets` has memory-mapped; it is equal in keys, dtypes, shapes and
+values to the items read one by one and collated. `lerobot_patches.py` adds this to LeRobotDataset. Oracle:
+`tests/test_reads.py`. A dataset with cameras is read so after `serve_frames`: its pictures are uint8 then, at one size.
 
 Shapes: N frames, in P pieces; B windows, K steps (one for each of a key's deltas), E episodes.
 """
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -25,6 +25,8 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.io_utils import hf_transform_to_torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data._utils.collate import collate
+
+from lerobot_unimask.data.frames import cached_frames
 
 
 class Item(dict):
@@ -141,6 +143,8 @@ def _read_columns(hf_dataset: datasets.Dataset, meta: LeRobotDatasetMetadata) ->
     ends = np.cumsum([len(batch) for batch in batches])
     columns = {}
     for key, row in hf_dataset[0].items():  # one row, as LeRobot reads it, tells dtype and shape
+        if key in meta.camera_keys:
+            continue  # an image, which `serve_frames` decodes
         if not isinstance(row, torch.Tensor) or row.numel() == 0:
             return None
         pieces = [_flat_numbers(batch.column(key)) for batch in batches]
@@ -160,7 +164,21 @@ def _read_columns(hf_dataset: datasets.Dataset, meta: LeRobotDatasetMetadata) ->
 _columns: WeakKeyDictionary[datasets.Dataset, Columns | None] = WeakKeyDictionary()
 
 
-def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> Windows:
+# The frames of each dataset's cameras that a policy reads, by key: (N, C, H, W) uint8 each.
+_frames: WeakKeyDictionary[LeRobotDataset, dict[str, np.ndarray]] = WeakKeyDictionary()
+
+
+def serve_frames(dataset: LeRobotDataset, cameras: Sequence[str], size: tuple[int, int]) -> None:
+    """From here on the dataset's batched reads hold these cameras' pictures, uint8 at this size, and no other camera's.
+
+    The first call for a dataset decodes them: see `cached_frames`, which also says what it raises.
+    """
+    _frames[dataset] = {key: cached_frames(dataset, key, size) for key in cameras}
+
+
+def gather(
+    columns: Columns, reader: DatasetReader, indices: Iterable[int], frames: Mapping[str, np.ndarray] | None = None
+) -> Windows:
     """The items `indices`, any order, negative ones from the end, as `DatasetReader.get_item` would read each.
 
     Steps outside the episode are copies of its nearest frame, flagged in `<key>_is_pad` (B, K).
@@ -180,7 +198,12 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
     index = columns.columns["index"].take(rows, pieces)[:, None]  # (B, 1)
     episode = columns.columns["episode_index"].take(rows, pieces)[:, None]
     start, end = columns.starts[episode], columns.ends[episode]
-    deltas_of = {key: tuple(deltas) for key, deltas in (reader.delta_indices or {}).items()}
+    frames = frames or {}
+    deltas_of = {
+        key: tuple(deltas)
+        for key, deltas in (reader.delta_indices or {}).items()
+        if key in columns.columns or key in frames  # not of a camera that nobody reads
+    }
     steps = {}  # deltas -> rows (B, K), their pieces (B, K), padded (B, K); keys mostly share their deltas
     for deltas in set(deltas_of.values()):
         wanted = index + np.array(deltas)  # (B, K), absolute: counted over all episodes
@@ -195,7 +218,10 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
                 )
         steps[deltas] = taken, columns.pieces_of(taken), wanted != absolute
 
-    batch: dict[str, Any] = {}
+    batch: dict[str, Any] = {
+        key: torch.from_numpy(np.asarray(pictures[steps[deltas_of[key]][0] if key in deltas_of else rows]))
+        for key, pictures in frames.items()
+    }
     for key, column in columns.columns.items():
         where = steps[deltas_of[key]][:2] if key in deltas_of else (rows, pieces)
         batch[key] = torch.from_numpy(column.take(*where)).to(column.dtype)
@@ -208,13 +234,16 @@ def gather(columns: Columns, reader: DatasetReader, indices: Iterable[int]) -> W
 def batched_read(dataset: LeRobotDataset) -> Callable[[Iterable[int]], Windows] | None:
     """`dataset.__getitems__`, or None where items must be read one by one, which PyTorch then does.
 
-    That is: a subclass that reads items its own way; a dataset being recorded; one with
-    cameras or any other column that is not plain numbers; one whose frames the user has given another transform; deltas
-    that LeRobot refuses.
+    That is: a subclass that reads items its own way; a dataset being recorded; one with cameras that `serve_frames` has
+    not been called for, or whose pictures LeRobot augments; one with any other column that is not plain numbers; one
+    whose frames the user has given another transform; deltas that LeRobot refuses.
     """
     if type(dataset).__getitem__ is not LeRobotDataset.__getitem__:
         return None
-    if (dataset.writer is not None and not dataset._is_finalized) or dataset.meta.camera_keys:
+    if dataset.writer is not None and not dataset._is_finalized:
+        return None
+    frames = _frames.get(dataset)
+    if dataset.meta.camera_keys and (frames is None or dataset.image_transforms is not None):
         return None
     hf_dataset = dataset.hf_dataset  # loads it if need be
     if hf_dataset.format["format_kwargs"].get("transform") is not hf_transform_to_torch:
@@ -224,6 +253,7 @@ def batched_read(dataset: LeRobotDataset) -> Callable[[Iterable[int]], Windows] 
     columns, reader = _columns[hf_dataset], dataset.reader
     if columns is None:
         return None
-    if reader.delta_indices is not None and not reader.delta_indices.keys() <= columns.columns.keys() - {"task_index"}:
+    known = (columns.columns.keys() | set(dataset.meta.camera_keys)) - {"task_index"}
+    if reader.delta_indices is not None and not reader.delta_indices.keys() <= known:
         return None
-    return partial(gather, columns, reader)
+    return partial(gather, columns, reader, frames=frames)

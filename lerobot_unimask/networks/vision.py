@@ -1,0 +1,93 @@
+"""Cameras: one token for each picture, from an encoder that all steps share.
+
+Shapes: B windows, K steps, C channels, H and W pixels, D width of a token, N pictures that are shown.
+"""
+
+import torch
+import torchvision
+from lerobot.policies.diffusion.modeling_diffusion import SpatialSoftmax
+from torch import Tensor, nn
+
+KEYPOINTS = 32  # as in LeRobot's diffusion policy: 64 numbers for each picture
+
+
+def _convolutions(channels: int) -> nn.Module:
+    """Three layers that two processor cores can train: a picture of 96 x 96 becomes 64 maps of 12 x 12."""
+    layers: list[nn.Module] = []
+    for before, after in ((channels, 32), (32, 64), (64, 64)):
+        layers += [nn.Conv2d(before, after, 3, stride=2, padding=1), nn.GroupNorm(after // 16, after), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _group_norms(module: nn.Module) -> nn.Module:
+    """Batch norms become group norms, in place: a picture's token depends on that picture only."""
+    for name, child in module.named_children():
+        if isinstance(child, nn.BatchNorm2d):
+            setattr(module, name, nn.GroupNorm(child.num_features // 16, child.num_features))
+        else:
+            _group_norms(child)
+    return module
+
+
+class CameraEncoder(nn.Module):
+    """A convolutional network, a spatial softmax (Finn et al., 2016, as LeRobot's diffusion policy has it), a layer.
+
+    Args:
+        shape: channels, height and width of the pictures.
+        width: size of a token, D.
+        backbone: name of a ResNet of torchvision, or None: three convolutions.
+        weights: name of that ResNet's weights in torchvision; None: drawn. With weights its batch norms stay, and are
+            used as in evaluation, so that no picture depends on others of its batch.
+
+    Raises:
+        ValueError: pictures so small that the spatial softmax has one place to look at.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int, int], width: int, backbone: str | None = None, weights: str | None = None
+    ):
+        super().__init__()
+        if backbone is None:
+            self.backbone = _convolutions(shape[0])
+        else:
+            resnet = getattr(torchvision.models, backbone)(weights=weights)
+            self.backbone = nn.Sequential(*list(resnet.children())[:-2])  # without its pooling and its classifier
+            if weights is None:
+                _group_norms(self.backbone)
+        self.frozen_norms = weights is not None
+        with torch.no_grad():
+            maps = self.backbone.eval()(torch.zeros(1, *shape)).shape[1:]
+        if maps[1] * maps[2] == 1:  # then a spatial softmax is the same for all pictures
+            raise ValueError(
+                f"Pictures of {shape[1]} x {shape[2]} are too small for {backbone or 'these convolutions'}: one place "
+                "of each map is left, so that all pictures would look the same; image_size has to be larger"
+            )
+        self.pool = SpatialSoftmax(maps, num_kp=KEYPOINTS)
+        self.out = nn.Linear(2 * KEYPOINTS, width)
+        self.width = width
+        self.train()
+
+    def train(self, mode: bool = True) -> "CameraEncoder":
+        super().train(mode)
+        if self.frozen_norms:
+            for module in self.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.eval()
+        return self
+
+    def forward(self, pictures: Tensor, shown: Tensor) -> Tensor:
+        """
+        Args:
+            pictures: (B, K, C, H, W), uint8 or numbers from 0 to 1.
+            shown: (B, K) booleans; pictures that are not shown are not looked at.
+
+        Returns:
+            (B, K, D): a token for each shown picture, 0 elsewhere.
+        """
+        tokens = self.out.weight.new_zeros(*shown.shape, self.width)
+        if not shown.any():
+            return tokens
+        seen = pictures[shown]  # (N, C, H, W)
+        seen = seen.to(tokens.dtype) / 255 if seen.dtype == torch.uint8 else seen.to(tokens.dtype)
+        keypoints = self.pool(self.backbone(2 * seen - 1)).flatten(1)  # (N, 2 * KEYPOINTS)
+        return tokens.masked_scatter(shown[..., None], self.out(keypoints))
