@@ -20,6 +20,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot_unimask.data.factors import (
     TASK,
     Feature,
+    check_layout,
     declared_feature,
     describe_features,
     group_features,
@@ -279,6 +280,7 @@ class UniMASKConfig(PreTrainedConfig):
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
         """
         found = {key: read_feature(key, entry) for key, entry in dataset_features.items() if is_numeric(entry)}
+        check_layout(dataset_features)
         features = group_features(found, self.properties, self.states)
         tasks = {name: columns for name, columns in self.features.items() if name == TASK}  # not among the columns
         features |= tasks

@@ -25,8 +25,9 @@ from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, last_checkpoint, read_weights
-from lerobot_unimask.data.factors import RETURN_TO_GO, TASK, make_factors
-from lerobot_unimask.data.returns import EpisodeStarts, read_starts
+from lerobot_unimask.data.factors import TASK, make_factors
+from lerobot_unimask.data.returns import EpisodeStarts
+from lerobot_unimask.data.taking_over import take_over
 from lerobot_unimask.data.window import Statistics, Window, frame_index, make_window, read_batch, task_column
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask
@@ -85,20 +86,19 @@ class UniMASKPolicy(PreTrainedPolicy):
         )
         self.network = make_network(config, self.factors)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
+        self._loss: Tensor | None = None  # of the last batch that was trained on
         self.origin: hub.Origin | None = None  # where it was loaded from
         self.folder: Path | None = None  # of the files that were loaded, on this machine
         self.reset()
 
     def _read_dataset(self, stats: Mapping[str, Mapping[str, Any]] | None, meta: LeRobotDatasetMetadata | None) -> None:
         """Take over what is kept of a training dataset: its statistics, and its episodes' starts and returns."""
-        if stats is not None:
-            self.statistics.fill(stats)
         if meta is not None:
             self.config.dataset_revision = hub.commit_of(Path(meta.root))
-        if meta is not None and "rtg" in self.factors:
-            starts = read_starts(Path(meta.root), [f.key for f in self.config.features["s"]], RETURN_TO_GO)
-            if starts is not None:
-                self.episode_starts.fill(*starts)
+            window = {"steps": self.config.context_length, "dropped": self.config.drop_n_last_frames or 0}
+            take_over(meta, stats or {}, self.config.features, self.statistics, self.episode_starts, **window)
+        elif stats is not None:
+            self.statistics.fill(stats)
 
     @property
     def device(self) -> torch.device:
@@ -132,6 +132,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         predictions = self.network(window, mask.shown, mask.causal, asked=mask.asked)
         losses = masked_losses(predictions, window, mask.asked, self.factors, reduction=reduction)
         loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
+        if self.training:
+            self._loss = loss.detach().mean()
         return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
 
     def train(self, mode: bool = True) -> "UniMASKPolicy":
@@ -141,7 +143,16 @@ class UniMASKPolicy(PreTrainedPolicy):
         return super().train(mode)
 
     def update(self) -> None:
-        """Count an update; LeRobot calls this after each optimiser step."""
+        """Count an update; LeRobot calls this after each optimiser step, when it has read the loss.
+
+        Raises:
+            FloatingPointError: the loss is no longer finite. The last checkpoint is whole: it was saved before.
+        """
+        if self._loss is not None and not self._loss.isfinite():
+            raise FloatingPointError(
+                f"The loss is {self._loss.item()} after {int(self.updates)} updates: training ends here, and the last "
+                "checkpoint is from before. A lower optimizer_lr, or optimizer_grad_clip_norm, may help."
+            )
         self.updates += 1
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -364,7 +375,9 @@ class UniMASKPolicy(PreTrainedPolicy):
         check_header(folder / WEIGHTS, network.state_dict(prefix="network."))
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)
+        before = {name: value.clone() for name, value in policy.statistics.state_dict().items()}
         policy._read_dataset(dataset_stats, dataset_meta)
+        policy.statistics.warn_of_difference(before)
         policy.origin, policy.folder = hub.Origin(source, hub.commit_of(folder)), folder
         return policy
 
@@ -374,7 +387,14 @@ class UniMASKPolicy(PreTrainedPolicy):
         return {"path": path, "revision": revision, "updates": int(self.updates)}
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """Config, weights and processors: all that acting needs."""
+        """Config, weights and processors: all that acting needs.
+
+        Raises:
+            FloatingPointError: a weight is not finite.
+        """
+        broken = [name for name, tensor in self.state_dict().items() if not tensor.isfinite().all()]
+        if broken:
+            raise FloatingPointError(f"{broken[0]} holds numbers that are not finite, so nothing has been saved.")
         super()._save_pretrained(save_directory, state_dict=state_dict)
         for pipeline in make_unimask_pre_post_processors(self.config):
             pipeline.save_pretrained(save_directory)

@@ -1,5 +1,6 @@
 """A dataset's columns -> the factors of the mask language: `s`, `a`, `rtg` and the properties."""
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,6 +8,8 @@ from typing import Any
 
 from lerobot.configs import PolicyFeature
 from lerobot.utils.constants import OBS_PREFIX
+
+logger = logging.getLogger(__name__)
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
@@ -95,9 +98,9 @@ def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = 
             if feature.categories is None:
                 label = feature.key.removeprefix("observation.")
                 dims = slice(start, start + feature.size)
-                components.append(Component(label, dims, None, gaussian=gaussian, names=_names(feature)))
+                components.append(Component(label, dims, None, gaussian=gaussian, names=names_of(feature)))
             else:
-                for i, (label, count) in enumerate(zip(_names(feature), feature.categories, strict=True)):
+                for i, (label, count) in enumerate(zip(names_of(feature), feature.categories, strict=True)):
                     dims, labels = slice(start + i, start + i + 1), tuple(feature.labels or ())
                     components.append(Component(label, dims, count, names=(label,), labels=labels))
             start += feature.size
@@ -107,7 +110,7 @@ def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = 
     return factors
 
 
-def _names(feature: Feature) -> tuple[str, ...]:
+def names_of(feature: Feature) -> tuple[str, ...]:
     """A name for each number of a column, the dataset's own where it has them."""
     plain = feature.key.removeprefix("observation.")
     return tuple(feature.names or ([plain] if feature.size == 1 else [f"{plain}.{i}" for i in range(feature.size)]))
@@ -134,6 +137,30 @@ def read_feature(key: str, entry: dict[str, Any]) -> Feature:
     return Feature(
         key, size, list(categories) if categories is not None else None, names if len(names) == size else None
     )
+
+
+def check_layout(entries: Mapping[str, Mapping[str, Any]]) -> None:
+    """What `unimask prepare` mends in a dataset's states and actions.
+
+    Raises:
+        ValueError: one of them has two dimensions.
+    """
+    for key in (STATE, ENVIRONMENT_STATE, ACTION):
+        entry = entries.get(key)
+        if entry is None:
+            continue
+        if len(entry["shape"]) > 1 and entry["dtype"] not in ("image", "video"):
+            raise ValueError(
+                f"{key} has shape {tuple(entry['shape'])}, and a model reads rows of numbers: "
+                "`unimask prepare --dataset.root=DIR --output=DIR` makes one row of it."
+            )
+        if entry["dtype"].startswith(("int", "uint")) and not entry.get("categories"):
+            logger.warning(
+                "%s holds whole numbers and is read as a continuous one. If they are choices, say how many there are: "
+                "`unimask prepare --categories %s=auto`.",
+                key,
+                key,
+            )
 
 
 def declared_feature(key: str, feature: PolicyFeature) -> Feature:

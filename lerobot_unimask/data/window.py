@@ -4,14 +4,28 @@ statistics.
 Legend of shapes: B windows, K steps, D the numbers of a factor.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lerobot_unimask.data.factors import ACTION, LOG_SCALE, STATE, Component, Factor, Feature, category_numbers
+from lerobot_unimask.data.factors import (
+    ACTION,
+    LOG_SCALE,
+    STATE,
+    Component,
+    Factor,
+    Feature,
+    category_numbers,
+    names_of,
+)
+from lerobot_unimask.data.soundness import check_statistics, compute_statistics
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -182,12 +196,15 @@ class Statistics(nn.Module):
         self.register_buffer("horizon", torch.tensor(float(context_length)))  # steps of the longest episode
         self.register_buffer("fps", torch.tensor(1.0))
 
-    def fill(self, dataset_stats: Mapping[str, Mapping[str, Any]]) -> None:
+    def fill(self, dataset_stats: Mapping[str, Mapping[str, Any]], *, root: Path | None = None) -> None:
         """Take over a dataset's statistics, as `LeRobotDatasetMetadata.stats` holds them.
 
+        Args:
+            root: folder of the dataset, from whose columns absent statistics are computed.
+
         Raises:
-            ValueError: a continuous feature has no mean and standard deviation there, or a discrete one more values
-                than categories.
+            ValueError: a continuous feature has no mean and standard deviation there, or unsound ones, or a discrete
+                one more values than categories.
         """
         for name, columns in self.features.items():
             mean, std = self.get_buffer(f"{name}_mean"), self.get_buffer(f"{name}_std")
@@ -195,21 +212,50 @@ class Statistics(nn.Module):
             for feature in columns:
                 dims = slice(start, start + feature.size)
                 start += feature.size
-                known = {key: _numbers(value).to(mean) for key, value in dataset_stats.get(feature.key, {}).items()}
+                known = {key: _numbers(value) for key, value in dataset_stats.get(feature.key, {}).items()}
                 if feature.categories is None:
                     if not {"mean", "std"} <= known.keys():
-                        raise ValueError(f"The dataset's statistics lack {feature.key!r}: recompute them with LeRobot.")
+                        if root is None:
+                            raise ValueError(
+                                f"The dataset's statistics lack {feature.key!r}: `unimask prepare` recomputes them."
+                            )
+                        computed = compute_statistics(root, feature.key)
+                        known = {kind: _numbers(value) for kind, value in computed.items()}
+                    kept = {kind: _numbers(known[kind]) for kind in ("mean", "std")}
+                    check_statistics(feature.key, names_of(feature), kept)
+                    known = known | {kind: value.to(mean) for kind, value in kept.items()}
                     constant = known["std"] <= 1e-6 * (1 + known["mean"].abs())  # is only shifted
                     mean[dims], std[dims] = known["mean"], torch.where(constant, 1.0, known["std"])
-                elif "max" in known and (known["max"] >= torch.tensor(feature.categories).to(mean)).any():
+                elif "max" in known and (known["max"] >= torch.tensor(feature.categories)).any():
                     raise ValueError(
                         f"{feature.key} reaches {known['max'].tolist()} in the dataset, whose info.json gives it the "
                         f"categories {feature.categories}: numbers from 0 to one less."
                     )
-        if "frame_index" in dataset_stats and "timestamp" in dataset_stats:
+        if root is None and "frame_index" in dataset_stats and "timestamp" in dataset_stats:
             last = _numbers(dataset_stats["frame_index"]["max"])
             self.horizon.fill_(last.item() + 1)
             self.fps.fill_((last / _numbers(dataset_stats["timestamp"]["max"])).item() if last > 0 else 1.0)
+
+    def keep_time(self, fps: float, horizon: int) -> None:
+        """Take over how many frames a second a dataset has, and how many steps its longest episode."""
+        self.fps.fill_(fps)
+        self.horizon.fill_(horizon)
+
+    def warn_of_difference(self, before: Mapping[str, Tensor]) -> None:
+        """Say by how much a dataset differs from the one that a checkpoint was trained on.
+
+        Args:
+            before: `state_dict` of the statistics that the checkpoint kept.
+        """
+        for name in self.features:
+            moved = (self.get_buffer(f"{name}_mean") - before[f"{name}_mean"]).abs() / before[f"{name}_std"]
+            if moved.max() > 0.1:
+                logger.warning(
+                    "This dataset is not what the checkpoint was trained on: a mean of %s lies %.2g of its standard "
+                    "deviations away. The model now reads it in this dataset's units.",
+                    name,
+                    moved.max().item(),
+                )
 
     def normalise(self, window: Window) -> Window:
         values = {

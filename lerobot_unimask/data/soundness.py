@@ -1,0 +1,99 @@
+"""Whether a dataset's numbers are sound: what is not finite is found before it is trained on, and said where it stands.
+
+Shapes: N frames, D numbers of a column.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+SEEN = HF_LEROBOT_HOME / "unimask" / "sound"  # markers of datasets that have been looked through
+
+
+def check_columns(root: Path, columns: Mapping[str, Sequence[str]]) -> None:
+    """Look through a dataset's columns once; a dataset whose files have not changed since is not read again.
+
+    Args:
+        root: folder of a LeRobotDataset.
+        columns: those to look through -> the names of their numbers.
+
+    Raises:
+        ValueError: a number is not finite; names the column, the number, and its episode and frame.
+    """
+    files = sorted((root / "data").glob("*/*.parquet"))
+    marker = SEEN / _fingerprint(root, files, columns)
+    if not files or marker.exists():
+        return
+    for path in files:
+        for key, values in _floats(path, list(columns)):
+            bad = ~np.isfinite(values)
+            if bad.any():
+                raise ValueError(_describe(path, key, columns[key], bad, values))
+    marker.parent.mkdir(parents=True, exist_ok=True)
+    marker.touch()
+
+
+def _fingerprint(root: Path, files: Sequence[Path], columns: Mapping[str, Sequence[str]]) -> str:
+    stats = [(str(path.relative_to(root)), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    return hashlib.sha256(json.dumps([str(root.resolve()), stats, sorted(columns)]).encode()).hexdigest()
+
+
+def _floats(path: Path, keys: Sequence[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Each column of floating-point numbers of a file as (N, D)."""
+    table = pq.read_table(path, columns=[key for key in keys if key in pq.read_schema(path).names], memory_map=True)
+    for key in table.column_names:
+        column = table.column(key).combine_chunks()
+        while pa.types.is_nested(column.type):
+            column = column.flatten()
+        if pa.types.is_floating(column.type) and len(table):
+            yield key, column.to_numpy(zero_copy_only=False).reshape(len(table), -1)
+
+
+def _describe(path: Path, key: str, names: Sequence[str], bad: np.ndarray, values: np.ndarray) -> str:
+    row, number = np.argwhere(bad)[0]
+    place = pq.read_table(path, columns=["episode_index", "frame_index"]).slice(int(row), 1).to_pylist()[0]
+    name = names[number] if number < len(names) else str(number)
+    return (
+        f"{key} holds {values[row, number]} for {name!r} in episode {place['episode_index']}, frame "
+        f"{place['frame_index']}, and {int(bad.sum()) - 1} more in this file that are not finite: mend the data, or "
+        "take these episodes out with lerobot-edit-dataset, delete_episodes."
+    )
+
+
+def check_statistics(key: str, names: Sequence[str], known: Mapping[str, np.ndarray]) -> None:
+    """
+    Args:
+        known: `mean` and `std` of a column, (D,) each.
+
+    Raises:
+        ValueError: they are not as many as the column's numbers, not finite, or a deviation is negative.
+    """
+    for kind in ("mean", "std"):
+        values = np.asarray(known[kind], dtype=np.float64).ravel()
+        if len(values) != len(names):
+            raise ValueError(
+                f"The dataset's statistics give {key} {len(values)} numbers as {kind}, and it has {len(names)}: "
+                "`unimask prepare` recomputes them."
+            )
+        wrong = ~np.isfinite(values) | ((values < 0) if kind == "std" else False)
+        if wrong.any():
+            at = int(wrong.argmax())
+            raise ValueError(
+                f"The dataset's statistics (meta/stats.json) give {values[at]} as the {kind} of {key}'s {names[at]!r}: "
+                "`unimask prepare` recomputes them."
+            )
+
+
+def compute_statistics(root: Path, key: str) -> dict[str, np.ndarray]:
+    """Mean and standard deviation of a column that the dataset's statistics lack, (D,) each."""
+    parts = [values for path in sorted((root / "data").glob("*/*.parquet")) for _, values in _floats(path, [key])]
+    if not parts:
+        raise ValueError(f"The dataset's statistics lack {key!r}, and it is no column of numbers in {root / 'data'}.")
+    values = np.concatenate(parts).astype(np.float64)
+    return {"mean": values.mean(0), "std": values.std(0)}

@@ -1,0 +1,182 @@
+"""Unsound numbers stop a training before its first step; what can be known of a dataset is not assumed."""
+
+import json
+import shutil
+
+import commands
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.factory import make_policy
+
+from dataset_builders.maze2d import build_maze2d
+from lerobot_unimask import UniMASKConfig
+from lerobot_unimask.data import soundness
+
+SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "device": "cpu", "push_to_hub": False}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    return build_maze2d(tmp_path_factory.mktemp("sound") / "maze", episodes=3, progress=False)
+
+
+@pytest.fixture
+def root(built, tmp_path, monkeypatch):
+    monkeypatch.setattr(soundness, "SEEN", tmp_path / "seen")
+    return shutil.copytree(built, tmp_path / "maze")
+
+
+def policy_of(root, **settings):
+    return make_policy(UniMASKConfig(**SMALL, **settings), ds_meta=LeRobotDatasetMetadata("local/maze", root=root))
+
+
+def spoil_column(root, key, frame, number, value):
+    (path,) = (root / "data").glob("*/*.parquet")
+    table = pq.read_table(path)
+    column = table.column(key).combine_chunks()
+    flat = column.flatten().to_numpy() if pa.types.is_nested(column.type) else column.to_numpy()
+    values = flat.reshape(len(table), -1).copy()
+    values[frame, number] = value
+    array = pa.array(values.ravel())
+    if pa.types.is_nested(column.type):
+        array = pa.FixedSizeListArray.from_arrays(array, values.shape[1])
+    table = table.set_column(table.column_names.index(key), table.schema.field(key), array.cast(column.type))
+    pq.write_table(table, path)
+
+
+def spoil_statistics(root, key, change):
+    path = root / "meta" / "stats.json"
+    stats = json.loads(path.read_text())
+    change(stats, key)
+    path.write_text(json.dumps(stats))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(
+    ("key", "number", "name"),
+    [("observation.state", 1, "y"), ("action", 0, "x"), ("observation.return_to_go", 0, "return_to_go")],
+)
+def test_an_unsound_number_is_named_with_its_place(root, key, number, name, value):
+    spoil_column(root, key, frame=437, number=number, value=value)
+    with pytest.raises(ValueError, match="not finite") as raised:
+        policy_of(root)
+    said = str(raised.value)
+    assert key in said
+    assert "episode 2, frame 37" in said
+    assert repr(str(value)) in repr(said) or str(value) in said
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda stats, key: stats[key]["mean"].__setitem__(1, float("nan")), ["nan", "mean", "y"]),
+        (lambda stats, key: stats[key]["std"].__setitem__(0, float("inf")), ["inf", "std", "x"]),
+        (lambda stats, key: stats[key]["std"].__setitem__(2, -1.0), ["-1.0", "std", "goal_x"]),
+        (lambda stats, key: stats[key]["mean"].pop(), ["3 numbers", "4"]),
+    ],
+    ids=["nan", "inf", "negative", "another length"],
+)
+def test_an_unsound_statistic_is_named(root, change, words):
+    spoil_statistics(root, "observation.state", change)
+    with pytest.raises(ValueError, match=r"observation\.state") as raised:
+        policy_of(root)
+    assert [word for word in words if word not in str(raised.value)] == []
+
+
+@pytest.mark.parametrize("absent", ["a column", "the file"])
+def test_absent_statistics_are_computed(root, absent):
+    before = policy_of(root).statistics.state_dict()
+    if absent == "the file":
+        (root / "meta" / "stats.json").unlink()
+    else:
+        spoil_statistics(root, "action", lambda stats, key: stats.pop(key))
+    after = policy_of(root).statistics.state_dict()
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=1e-3, atol=1e-4)
+
+
+def test_time_comes_from_the_metadata_whatever_the_statistics_lack(root):
+    for key in ("timestamp", "frame_index"):
+        spoil_statistics(root, key, lambda stats, key: stats.pop(key))
+    statistics = policy_of(root).statistics
+    assert statistics.fps.item() == 100
+    assert statistics.horizon.item() == 200
+
+
+def test_a_dataset_seen_before_is_not_read_again(root, monkeypatch):
+    policy_of(root)
+    monkeypatch.setattr(soundness, "_floats", None)  # reading would fail
+    policy_of(root)
+    (path,) = (root / "data").glob("*/*.parquet")
+    path.touch()  # changed, as far as one can tell
+    with pytest.raises(TypeError):
+        policy_of(root)
+
+
+def test_a_training_on_an_unsound_dataset_ends_before_its_first_step(root, tmp_path):
+    spoil_column(root, "action", frame=3, number=1, value=np.nan)
+    flags = [f"--policy.{name}={str(value).lower()}" for name, value in SMALL.items()]
+    data = ["--dataset.repo_id=local/maze", f"--dataset.root={root}", "--steps=2", "--batch_size=4"]
+    result = commands.run("lerobot-train", "--policy.type=unimask", *flags, *data, "--output_dir=run", cwd=tmp_path)
+    assert result.status != 0
+    assert "episode 0, frame 3" in result.stderr
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_windows_longer_than_every_episode_are_refused_by_name(root):
+    with pytest.raises(ValueError, match="context_length") as raised:
+        policy_of(root, context_length=300)
+    assert "200" in str(raised.value)
+
+
+def test_a_loss_that_is_not_finite_ends_the_training_and_is_not_saved(tiny_policy, doorkey_batch, tmp_path):
+    policy = tiny_policy().train()
+    policy.forward(doorkey_batch)
+    policy.update()
+    with torch.no_grad():
+        next(policy.network.parameters()).fill_(float("nan"))
+    policy.forward(doorkey_batch)
+    with pytest.raises(FloatingPointError, match="nan after 1 updates"):
+        policy.update()
+    with pytest.raises(FloatingPointError, match="nothing has been saved"):
+        policy.save_pretrained(tmp_path / "checkpoint")
+    assert not (tmp_path / "checkpoint" / "model.safetensors").exists()
+
+
+def test_a_column_of_numpy_numbers_is_a_column(tiny_policy, doorkey_batch):
+    arrays = {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in doorkey_batch.items()}
+    policy = tiny_policy()
+    one, other = policy.make_window(arrays), policy.make_window(doorkey_batch)
+    assert torch.equal(one.valid, other.valid)
+    assert all(torch.equal(one.values[name], value) for name, value in other.values.items())
+
+
+def test_fine_tuning_says_how_far_another_dataset_lies(tiny_policy, root, tmp_path, caplog):
+    from lerobot_unimask import UniMASKPolicy
+
+    policy = policy_of(root)
+    policy.save_pretrained(tmp_path / "checkpoint")
+    meta = LeRobotDatasetMetadata("local/maze", root=root)
+    UniMASKPolicy.from_pretrained(tmp_path / "checkpoint", dataset_stats=meta.stats, dataset_meta=meta)
+    assert "deviations away" not in caplog.text
+    moved = {key: dict(value) for key, value in meta.stats.items()}
+    moved["action"]["mean"] = moved["action"]["mean"] + 3 * moved["action"]["std"]
+    UniMASKPolicy.from_pretrained(tmp_path / "checkpoint", dataset_stats=moved, dataset_meta=meta)
+    assert "mean of a lies 3 of its standard deviations away" in caplog.text
+
+
+def test_a_state_of_two_dimensions_is_said_to_be_one(doorkey):
+    features = {**doorkey.meta.features, "observation.state": {"dtype": "float32", "shape": (2, 2), "names": None}}
+    with pytest.raises(ValueError, match=r"\(2, 2\)") as raised:
+        UniMASKConfig(device="cpu").set_dataset_feature_metadata(features)
+    assert "unimask prepare" in str(raised.value)
+
+
+def test_whole_numbers_without_categories_are_pointed_out(doorkey, caplog):
+    entry = {name: value for name, value in doorkey.meta.features["action"].items() if name != "categories"}
+    UniMASKConfig(device="cpu").set_dataset_feature_metadata({**doorkey.meta.features, "action": entry})
+    assert "--categories action=auto" in caplog.text
