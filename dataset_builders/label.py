@@ -15,7 +15,7 @@ import re
 import shutil
 import sys
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,13 +149,13 @@ def add_label(
     feature, column = _feature(column, categories)
     partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
-        _copy_rest(root, partial)
+        copy_rest(root, partial)
         info["features"][name] = feature
         statistics = episode_statistics(column, lengths)
         _write_data(root, partial, info, name, column)
         _write_episodes(root, partial, name, statistics)
         _write_meta(partial, info, name, dataset_statistics(statistics), how)
-        _put_in_place(partial, target, replacing=output is None)
+        put_in_place(partial, target, replacing=output is None)
     except BaseException:  # Ctrl-C too
         shutil.rmtree(partial, ignore_errors=True)
         raise
@@ -172,7 +172,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _data_files(root: Path) -> list[Path]:
+def data_files(root: Path) -> list[Path]:
     """In the order in which LeRobot reads them."""
     return sorted((root / "data").glob("*/*.parquet"))
 
@@ -184,7 +184,7 @@ def _label_all(
     no_numbers = ("image", "video", "string", "language")
     features = {key: entry for key, entry in info["features"].items() if entry["dtype"] not in no_numbers}
     numbers = [key for key, entry in features.items() if len(entry["shape"]) == 1]
-    tables = [pq.read_table(path, columns=numbers) for path in _data_files(root)]
+    tables = [pq.read_table(path, columns=numbers) for path in data_files(root)]
     table = pa.concat_tables(tables)
     columns = {key: _as_array(table.column(key), info["features"][key]["shape"][0]) for key in numbers}
     starts = np.flatnonzero(np.diff(columns["episode_index"], prepend=-1))
@@ -255,9 +255,13 @@ def _feature(column: np.ndarray, categories: int | None) -> tuple[dict[str, Any]
 # --- Files ------------------------------------------------------------------------------------------------------------
 
 
-def _copy_rest(root: Path, partial: Path) -> None:
-    """Everything that is not rewritten; large files that never change as links where the disk allows it."""
-    rewritten = {*_data_files(root), *_episode_files(root)}
+def copy_rest(root: Path, partial: Path, without: Sequence[str] = ()) -> None:
+    """Everything that is not rewritten; large files that never change as links where the disk allows it.
+
+    Args:
+        without: cameras whose files stay behind.
+    """
+    rewritten = {*data_files(root), *episode_files(root)}
 
     def copy(source: str, target: str) -> None:
         if Path(source) in rewritten:
@@ -270,10 +274,13 @@ def _copy_rest(root: Path, partial: Path) -> None:
                 pass
         shutil.copy2(source, target)
 
-    shutil.copytree(root, partial, copy_function=copy)
+    def left_out(folder: str, names: list[str]) -> list[str]:
+        return [name for name in names if Path(folder).relative_to(root).parts == ("videos",) and name in without]
+
+    shutil.copytree(root, partial, copy_function=copy, ignore=left_out)
 
 
-def _episode_files(root: Path) -> list[Path]:
+def episode_files(root: Path) -> list[Path]:
     return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
 
 
@@ -290,8 +297,8 @@ def _write_data(root: Path, partial: Path, info: Mapping[str, Any], name: str, c
         array = flat if part.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, part.shape[1])
         return table.append_column(field, array.cast(field.type)).replace_schema_metadata(schema.metadata)
 
-    for path in _data_files(root):
-        _rewrite(path, partial / path.relative_to(root), with_label)
+    for path in data_files(root):
+        rewrite(path, partial / path.relative_to(root), with_label)
 
 
 def _write_episodes(root: Path, partial: Path, name: str, statistics: Mapping[str, np.ndarray]) -> None:
@@ -304,11 +311,11 @@ def _write_episodes(root: Path, partial: Path, name: str, statistics: Mapping[st
             table = table.append_column(f"stats/{name}/{statistic}", array)
         return table
 
-    for path in _episode_files(root):
-        _rewrite(path, partial / path.relative_to(root), with_statistics)
+    for path in episode_files(root):
+        rewrite(path, partial / path.relative_to(root), with_statistics)
 
 
-def _rewrite(source: Path, target: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+def rewrite(source: Path, target: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     """A parquet file with each of its row groups changed: the new file has the old one's layout."""
     with contextlib.ExitStack() as stack:
         old, writer = stack.enter_context(pq.ParquetFile(source)), None
@@ -333,7 +340,7 @@ def _write_meta(
     path.write_text(json.dumps(record, indent=4) + "\n")
 
 
-def _put_in_place(partial: Path, target: Path, *, replacing: bool) -> None:
+def put_in_place(partial: Path, target: Path, *, replacing: bool) -> None:
     """The finished folder takes its name. In place of an old dataset, that one is set aside first and removed last."""
     if not replacing:
         if target.exists():

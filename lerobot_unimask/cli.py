@@ -5,10 +5,10 @@ import logging
 import shlex
 import sys
 
-from lerobot_unimask.commands import bench, build, demo, given, label, measure, paper, push, query, serve, validate
+from lerobot_unimask.commands import bench, build, demo, given, measure, paper, prepare, push, query, serve, validate
 from lerobot_unimask.commands.flags import Parser, check_dataset
 
-COMMANDS = (demo, build, label, query, given, validate, measure, push, serve, bench, paper)
+COMMANDS = (demo, build, prepare, query, given, validate, measure, push, serve, bench, paper)
 
 
 def make_parser() -> Parser:

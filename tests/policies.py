@@ -18,6 +18,7 @@ CONTINUOUS_STATS = {
     "timestamp": {"max": [4.9]},
 }
 
+SMALL_FLAGS = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
 PARTS = ("probabilities", "mean", "scale")
 KINDS = ("doorkey", "continuous", "gaussian")
 

@@ -56,7 +56,7 @@ def test_it_opens_with_the_commands_that_use_it(path: Path, config: TrainPipelin
     (build,) = (line for line in lines if line.startswith("uv run unimask build "))
     arguments = make_parser().parse_args(shlex.split(build)[3:])
     root = Path(config.dataset.root)
-    if "uv run unimask label " in "\n".join(lines):
+    if "uv run unimask prepare " in "\n".join(lines):
         text = " ".join(line.removesuffix("\\") for line in lines[lines.index(build) + 1 :])
         label = make_parser().parse_args(shlex.split(text.partition("uv run ")[2].partition(" uv run ")[0])[1:])
         assert label.root == arguments.root

@@ -213,7 +213,7 @@ def test_properties_become_factors_by_the_last_part_of_their_names():
     [
         (
             ["observation.corner"],
-            r"does not have; columns that could be one: observation.visits_corner, .*unimask label",
+            r"does not have; columns that could be one: observation.visits_corner, .*unimask prepare",
         ),
         (["corner"], "it is named observation.NAME"),
         (["observation.state"], "is a factor already"),

@@ -1,4 +1,4 @@
-"""`unimask label`: the new column is right, everything else is untouched, and LeRobot reads the result."""
+"""`unimask prepare`: the new column is right, everything else is untouched, and LeRobot reads the result."""
 
 import json
 import shutil
@@ -28,13 +28,18 @@ def root(doorkey_root, tmp_path):
     return Path(shutil.copytree(doorkey_root, tmp_path / "data"))
 
 
+def placed(flags):
+    """Where the result goes: in the old dataset's place, unless there is an output."""
+    return [*flags, *["--replace=true"] * (not any(str(flag).startswith("--output") for flag in flags))]
+
+
 @pytest.fixture
 def refused(capsys):
-    """refused("--visits=...") -> the error of `unimask label`."""
+    """refused("--visits=...") -> the error of `unimask prepare`."""
 
     def run(*flags):
         with pytest.raises(SystemExit) as ended:
-            cli.main(["label", *map(str, flags)])
+            cli.main(["prepare", *map(str, placed(flags))])
         assert ended.value.code == 2
         return capsys.readouterr().err
 
@@ -48,13 +53,13 @@ def column(root, name):
 
 
 def label(root, *flags):
-    cli.main(["label", f"--dataset.root={root}", *map(str, flags)])
+    cli.main(["prepare", f"--dataset.root={root}", *map(str, placed(flags))])
 
 
 def test_visits_is_a_category_of_each_episode(root, tmp_path, capsys):
     before = files(root)
     label(root, f"--output={tmp_path / 'new'}", f"--name={CORNER}", "--visits=agent_cell=0")
-    assert capsys.readouterr().out == f"{CORNER} in {tmp_path / 'new'}\n"
+    assert f"{CORNER} in {tmp_path / 'new'}\n" in capsys.readouterr().out
     assert files(root) == before
     dataset = LeRobotDataset("local/new", root=tmp_path / "new")
     cells = np.stack([dataset[i]["observation.state"].numpy() for i in range(EPISODES * T)]).reshape(EPISODES, T, 2)
@@ -187,7 +192,7 @@ def fails(episode):
         (["--name=corner", "--visits=agent_cell=0"], "observation.NAME"),
         (["--visits=agent_cell=0"], "--name is missing"),
         (["--return_to_go"], "observation.return_to_go already"),
-        (["--name=observation.x"], "one of the arguments"),
+        (["--name=observation.x"], "add --return_to_go, --visits or --function"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -230,7 +235,7 @@ def test_a_commit_of_the_hub_stays_as_it_is(root, refused):
 
 
 @pytest.mark.parametrize("output", [None, "new"])
-@pytest.mark.parametrize("moment", ["_label_all", "_write_data", "_write_meta", "_put_in_place"])
+@pytest.mark.parametrize("moment", ["_label_all", "_write_data", "_write_meta", "put_in_place"])
 def test_an_interruption_leaves_nothing_half_written(moment, output, root, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -239,7 +244,7 @@ def test_an_interruption_leaves_nothing_half_written(moment, output, root, monke
     monkeypatch.setattr(dataset_builders.label, moment, interrupt)
     flags = [] if output is None else [f"--output={root.parent / output}"]
     with pytest.raises(SystemExit, match="interrupted"):
-        cli.main(["label", f"--dataset.root={root}", f"--name={CORNER}", "--visits=agent_cell=0", *flags])
+        cli.main(["prepare", f"--dataset.root={root}", f"--name={CORNER}", "--visits=agent_cell=0", *placed(flags)])
     assert files(root) == before
     assert list(root.parent.iterdir()) == [root]
 

@@ -133,6 +133,8 @@ def is_numeric(entry: dict[str, Any]) -> bool:
 def read_feature(key: str, entry: dict[str, Any]) -> Feature:
     size = entry["shape"][0] if entry["shape"] else 1
     categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
+    if categories is not None and len(categories) != size:
+        raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
     names = flat_names(entry.get("names"))
     return Feature(
         key, size, list(categories) if categories is not None else None, names if len(names) == size else None
@@ -217,7 +219,7 @@ def group_features(
             others = [other for other in found if other.startswith(OBS_PREFIX) and other not in taken]
             raise ValueError(
                 f"properties names {key!r}, which the dataset does not have; columns that could be one: "
-                f"{', '.join(others) or 'none'}. `unimask label` adds one."
+                f"{', '.join(others) or 'none'}. `unimask prepare` adds one."
             )
         if key in taken or found[key] in features.get(name, []):
             raise ValueError(f"{key!r} is a factor already, so it cannot be named in properties as well.")

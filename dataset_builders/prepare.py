@@ -1,0 +1,298 @@
+"""Makes one LeRobotDataset from another: from a dataset as it was found to one that trains.
+
+Columns get LeRobot's names, cameras without files go, columns of two dimensions become rows, nested names become plain,
+whole numbers that are choices get their categories, absent statistics are computed, and format v2.1 becomes v3.0 by
+LeRobot's own converter. Videos are linked, not copied, where the disk allows it. The new dataset appears whole or not
+at all, and the old one stays as it is.
+
+Shapes: N frames, E episodes, D numbers of a column.
+"""
+
+import shutil
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from dataset_builders.label import copy_rest, data_files, episode_files, put_in_place, rewrite
+from dataset_builders.writer import dataset_statistics, episode_statistics, refuse_existing
+from lerobot_unimask.data.episodes import check_folder
+from lerobot_unimask.data.factors import flat_names
+from lerobot_unimask.records import read_json, write_json
+
+PICTURES = ("image", "video")
+OTHER_NAMES = {  # what others call what LeRobot calls so
+    OBS_STATE: ("state", "states", "observation.states", "qpos", "observation.qpos", "proprio"),
+    ACTION: ("actions", "act"),
+}
+AUTO = "auto"
+
+
+@dataclass
+class Plan:
+    """What is to be done to a dataset, and why.
+
+    Attributes:
+        convert: whether to bring format v2.1 to v3.0.
+        rename: old name -> new name.
+        drop: columns to leave out.
+        flatten: columns of several dimensions that become rows.
+        plain: columns whose names are nested.
+        categories: column -> number of categories, or `auto` to count them.
+        statistics: columns, by their new names, whose statistics are absent.
+        why: a line for each step.
+    """
+
+    convert: bool = False
+    rename: dict[str, str] = field(default_factory=dict)
+    drop: list[str] = field(default_factory=list)
+    flatten: list[str] = field(default_factory=list)
+    plain: list[str] = field(default_factory=list)
+    categories: dict[str, int | str] = field(default_factory=dict)
+    statistics: list[str] = field(default_factory=list)
+    why: list[str] = field(default_factory=list)
+
+
+def make_plan(
+    root: Path,
+    *,
+    rename: Mapping[str, str] | None = None,
+    drop: Sequence[str] = (),
+    categories: Mapping[str, str] | None = None,
+) -> Plan:
+    """Look through a dataset's metadata and say what it needs to train.
+
+    Args:
+        root: folder of the dataset.
+        rename: old name -> new name, beside what is found out.
+        drop: columns to leave out; `missing`: the cameras whose files are absent.
+        categories: column -> how many, or `auto`.
+
+    Raises:
+        FileNotFoundError: there is no dataset in `root`.
+        ValueError: a column that there is not, or a name that is taken.
+    """
+    check_folder(root)
+    info = read_json(root / "meta" / "info.json")
+    features: dict[str, dict[str, Any]] = info["features"]
+    plan, asked = Plan(), dict(rename or {})
+    for key in (*asked, *(categories or {}), *(name for name in drop if name != "missing")):
+        if key not in features and key not in asked.values():
+            raise ValueError(f"{root} has no column {key!r}; it has {', '.join(features)}.")
+    if not str(info.get("codebase_version", "")).startswith("v3"):
+        plan.convert = True
+        plan.why.append(f"convert: the format is {info.get('codebase_version')}, and LeRobot reads v3.0.")
+    for wanted, others in OTHER_NAMES.items():
+        found = [name for name in others if name in features and name not in asked]
+        have = wanted in features or (wanted == OBS_STATE and OBS_ENV_STATE in features)
+        if not have and wanted not in asked.values() and found:
+            asked[found[0]] = wanted
+    for old, new in asked.items():
+        if new in features:
+            raise ValueError(f"{root} has a column {new!r} already, so {old!r} cannot be called so.")
+        if features[old]["dtype"] == "video":
+            raise ValueError(f"{old} is a video, whose files bear its name: it cannot be renamed here.")
+        plan.rename[old] = new
+        plan.why.append(f"--rename {old}={new}: LeRobot's policies read columns of that name.")
+    absent = [] if plan.convert else cameras_without_files(root, features)
+    plan.drop = [name for name in drop if name != "missing"]
+    for key in absent:
+        if key not in plan.drop:
+            plan.drop.append(key)
+            plan.why.append(f"--drop {key}: its files are not in {root / 'videos'}.")
+    stats = read_json(root / "meta" / "stats.json") if (root / "meta" / "stats.json").exists() else {}
+    for old, entry in features.items():
+        new = plan.rename.get(old, old)
+        if old in plan.drop or entry["dtype"] in (*PICTURES, "string", "language"):
+            continue
+        if len(entry["shape"]) > 1:
+            plan.flatten.append(old)
+            plan.why.append(f"flatten {new}: it has shape {tuple(entry['shape'])}, and policies read rows of numbers.")
+        names = entry.get("names")
+        if names and names != flat_names(names):
+            plan.plain.append(old)
+            plan.why.append(f"names of {new}: they are nested.")
+        whole = entry["dtype"].startswith(("int", "uint")) and "categories" not in entry
+        if new == ACTION and whole and new not in (categories or {}) and old not in (categories or {}):
+            plan.why.append(f"(not done) {new} holds whole numbers: if they are choices, --categories {new}=auto.")
+        missing = {"mean", "std"} - stats.get(old, {}).keys()
+        if (missing and not plan.convert) or old in plan.flatten:
+            plan.statistics.append(new)
+            plan.why.append(f"statistics of {new}: meta/stats.json lacks them.")
+    for key, count in (categories or {}).items():
+        plan.categories[plan.rename.get(key, key)] = count if count == AUTO else int(count)
+        plan.why.append(f"--categories {key}={count}.")
+    return plan
+
+
+def cameras_without_files(root: Path, features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The video columns of which a file that the metadata name is not there."""
+    lost = []
+    for key in (key for key, entry in features.items() if entry["dtype"] == "video"):
+        wanted = set()
+        for path in episode_files(root):
+            columns = [f"videos/{key}/{kind}_index" for kind in ("chunk", "file")]
+            if set(columns) <= set(pq.read_schema(path).names):
+                wanted |= {tuple(row.values()) for row in pq.read_table(path, columns=columns).to_pylist()}
+        files = [root / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4" for chunk, file in wanted]
+        if not files or not all(file.exists() for file in files):
+            lost.append(key)
+    return lost
+
+
+def prepare(root: Path, plan: Plan, *, output: Path | None = None) -> Path:
+    """Carry out a plan.
+
+    Args:
+        output: folder to write to, new or empty; None: in place of `root`.
+
+    Returns:
+        The new dataset's folder.
+
+    Raises:
+        FileExistsError: `output` exists and is not an empty folder; it is left as it was.
+        ValueError: a column does not hold what the plan says of it.
+    """
+    root = Path(root).expanduser().resolve()
+    target = root if output is None else refuse_existing(output)
+    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    converted = partial.with_name(f"{partial.name}.v30")
+    try:
+        source = convert(root, converted) if plan.convert else root
+        if plan.convert:  # now the files can be looked for
+            plan.drop += [k for k in make_plan(source).drop if k not in plan.drop]
+        copy_rest(source, partial, without=plan.drop)
+        _rewrite_all(source, partial, plan)
+        put_in_place(partial, target, replacing=output is None)
+    except BaseException:  # Ctrl-C too
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    finally:
+        shutil.rmtree(converted, ignore_errors=True)
+    return target
+
+
+def convert(root: Path, target: Path) -> Path:
+    """A dataset of format v2.1 in format v3.0, by the parts of LeRobot's converter; `root` stays as it is."""
+    from lerobot.scripts import convert_dataset_v21_to_v30 as lerobots
+
+    sizes = lerobots.DEFAULT_DATA_FILE_SIZE_IN_MB, lerobots.DEFAULT_VIDEO_FILE_SIZE_IN_MB
+    lerobots.validate_local_dataset_version(root)
+    lerobots.convert_info(root, target, *sizes)
+    lerobots.convert_tasks(root, target)
+    episodes = lerobots.convert_data(root, target, sizes[0])
+    videos = lerobots.convert_videos(root, target, sizes[1])
+    lerobots.convert_episodes_metadata(root, target, episodes, videos)
+    return target
+
+
+def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
+    info = read_json(source / "meta" / "info.json")
+    old_features = {key: entry for key, entry in info["features"].items() if key not in plan.drop}
+    columns = _read_numbers(source, old_features, plan)
+    features = {plan.rename.get(old, old): _entry(old, entry, plan, columns) for old, entry in old_features.items()}
+    schema = get_hf_features_from_features({k: {**e, "shape": tuple(e["shape"])} for k, e in features.items()})
+    new_names = {old: plan.rename.get(old, old) for old in old_features}
+
+    def with_columns(table: pa.Table) -> pa.Table:
+        stored = schema.arrow_schema
+        arrays = {new: table.column(old) for old, new in new_names.items() if old in table.column_names}
+        fields = [stored.field(new) for new in arrays]
+        cells = [_as_stored(arrays[f.name], f.type, features[f.name]["shape"]) for f in fields]
+        return pa.table(cells, schema=pa.schema(fields, metadata=stored.metadata))
+
+    for path in data_files(source):
+        rewrite(path, partial / path.relative_to(source), with_columns)
+    lengths = _lengths(source)
+    found = {key: episode_statistics(columns[key], lengths) for key in plan.statistics if key in columns}
+    for path in episode_files(source):
+        rewrite(path, partial / path.relative_to(source), lambda table: _episodes_table(table, plan, found))
+    path = source / "meta" / "stats.json"
+    stats = {
+        plan.rename.get(k, k): v for k, v in (read_json(path) if path.exists() else {}).items() if k not in plan.drop
+    }
+    for key, statistics in found.items():
+        stats[key] = {name: value.tolist() for name, value in dataset_statistics(statistics).items()}
+    write_json(partial / "meta" / "stats.json", stats, say=False)
+    write_json(partial / "meta" / "info.json", {**info, "features": features}, say=False)
+
+
+def _read_numbers(source: Path, features: Mapping[str, Mapping[str, Any]], plan: Plan) -> dict[str, np.ndarray]:
+    """The columns that have to be counted or measured, by their new names, (N, D) each."""
+    wanted = {*plan.statistics, *plan.categories}
+    columns = {}
+    for old in features:
+        new = plan.rename.get(old, old)
+        if new in wanted:
+            parts = [_flat(pq.read_table(path, columns=[old]).column(old)) for path in data_files(source)]
+            columns[new] = np.concatenate(parts).reshape(sum(_lengths(source)), -1)
+    return columns
+
+
+def _entry(old: str, entry: dict[str, Any], plan: Plan, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """A column's entry in info.json, as it will be."""
+    entry, new = dict(entry), plan.rename.get(old, old)
+    if old in plan.flatten:
+        entry["shape"] = [int(np.prod(entry["shape"]))]
+    if old in plan.plain or old in plan.flatten:
+        names = flat_names(entry.get("names"))
+        entry["names"] = names if len(names) == entry["shape"][0] else None
+    if new in plan.categories:
+        values = columns[new]
+        count = int(values.max()) + 1 if plan.categories[new] == AUTO else plan.categories[new]
+        if values.min() < 0 or values.max() >= count or (values != np.round(values)).any():
+            raise ValueError(f"{new} runs from {values.min():g} to {values.max():g}; categories count from 0 on.")
+        entry |= {"dtype": "int64", "categories": [int(count)] * values.shape[1]}
+    return entry
+
+
+def _flat(column: pa.ChunkedArray) -> np.ndarray:
+    array = column.combine_chunks()
+    array = pa.concat_arrays(array.chunks) if isinstance(array, pa.ChunkedArray) else array
+    while pa.types.is_nested(array.type) or isinstance(array, pa.ExtensionArray):
+        array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+    return array.to_numpy(zero_copy_only=False)
+
+
+def _as_stored(column: pa.ChunkedArray, kind: pa.DataType, shape: Sequence[int]) -> pa.Array | pa.ChunkedArray:
+    """A column as its new type stores it: a list of a row's numbers, or the number itself."""
+    if column.type == kind:
+        return column
+    if pa.types.is_struct(column.type):  # pictures
+        return column.cast(kind)
+    flat = pa.array(_flat(column))
+    size = int(np.prod(shape))
+    return (flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)).cast(kind)
+
+
+def _episodes_table(table: pa.Table, plan: Plan, found: Mapping[str, Mapping[str, np.ndarray]]) -> pa.Table:
+    """The episodes' metadata with columns renamed, dropped, and statistics added."""
+    gone = {*plan.drop, *found}
+    kept = []
+    for name in table.column_names:
+        kind, _, rest = name.partition("/")
+        key = rest.rpartition("/")[0]
+        if kind in ("stats", "videos") and (key in gone or plan.rename.get(key, key) in gone):
+            continue
+        new = f"{kind}/{plan.rename[key]}/{rest.rpartition('/')[2]}" if key in plan.rename else name
+        kept.append((new, table.column(name)))
+    result = pa.table([column for _, column in kept], names=[name for name, _ in kept])
+    rows = table.column("episode_index").to_numpy()
+    for key, statistics in found.items():
+        for statistic, values in statistics.items():  # (E, D)
+            chosen = values[rows] if statistic == "count" else values[rows].astype(np.float64)
+            offsets = np.arange(len(rows) + 1, dtype=np.int32) * chosen.shape[1]
+            array = pa.ListArray.from_arrays(offsets, pa.array(chosen.ravel()))
+            result = result.append_column(f"stats/{key}/{statistic}", array)
+    return result
+
+
+def _lengths(source: Path) -> np.ndarray:
+    return np.concatenate([pq.read_table(path, columns=["length"]).column("length") for path in episode_files(source)])

@@ -1,0 +1,215 @@
+"""`unimask prepare`: datasets as others record them, made into ones that train, resume and can be asked."""
+
+import json
+import shutil
+
+import commands
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from policies import SMALL_FLAGS
+
+from dataset_builders.prepare import make_plan, prepare
+from lerobot_unimask import UniMASKPolicy, cli, query
+from lerobot_unimask.data.episodes import open_dataset, read_window
+
+JOINTS = ["shoulder", "elbow"]
+LENGTHS = [12, 15, 11]
+
+
+def record(root, features, frames, **settings):
+    """A dataset as LeRobot's own recorder writes it; `frames(episode, step)` -> one frame."""
+    dataset = LeRobotDataset.create("me/robot", fps=30, features=features, root=root, use_videos=False, **settings)
+    for episode, length in enumerate(LENGTHS):
+        for step in range(length):
+            dataset.add_frame({**frames(episode, step), "task": "wave"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def waves(episode, step):
+    angle = 0.1 * step + episode
+    return np.array([np.sin(angle), np.cos(angle)], dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def renamed(tmp_path_factory):
+    """Columns `state`, of two dimensions, and `actions`, names nested one deep."""
+    features = {
+        "state": {"dtype": "float32", "shape": (2, 1), "names": [JOINTS, ["angle"]]},
+        "actions": {"dtype": "float32", "shape": (2,), "names": {"motors": JOINTS}},
+        "choice": {"dtype": "int64", "shape": (1,), "names": None},
+    }
+    return record(
+        tmp_path_factory.mktemp("renamed") / "data",
+        features,
+        lambda episode, step: {
+            "state": waves(episode, step)[:, None],
+            "actions": waves(episode, step + 1),
+            "choice": np.array([step % 3]),
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory):
+    """Format v3.0 with a camera whose files are gone."""
+    root = record(
+        tmp_path_factory.mktemp("blind") / "data",
+        {
+            "observation.state": {"dtype": "float32", "shape": (2,), "names": JOINTS},
+            "action": {"dtype": "float32", "shape": (2,), "names": JOINTS},
+        },
+        lambda episode, step: {"observation.state": waves(episode, step), "action": waves(episode, step + 1)},
+    )
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"]["observation.images.front"] = {"dtype": "video", "shape": [48, 64, 3], "names": ["h", "w", "c"]}
+    info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    return root
+
+
+@pytest.fixture(scope="module")
+def old(blind, tmp_path_factory):
+    """The same recording in format v2.1, as LeRobot wrote it before."""
+    root = tmp_path_factory.mktemp("old") / "data"
+    table = pa.concat_tables([pq.read_table(path) for path in sorted((blind / "data").glob("*/*.parquet"))])
+    info = json.loads((blind / "meta" / "info.json").read_text())
+    info["features"].pop("observation.images.front")
+    info |= {
+        "codebase_version": "v2.1",
+        "total_videos": 0,
+        "total_chunks": 1,
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": None,
+    }
+    (root / "meta").mkdir(parents=True)
+    (root / "data" / "chunk-000").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    (root / "meta" / "tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "wave"}) + "\n")
+    episodes, statistics = [], []
+    for episode, length in enumerate(LENGTHS):
+        rows = table.filter(pa.compute.equal(table["episode_index"], episode))
+        pq.write_table(rows, root / "data" / "chunk-000" / f"episode_{episode:06d}.parquet")
+        episodes.append({"episode_index": episode, "tasks": ["wave"], "length": length})
+        stats = {}
+        for key in info["features"]:
+            values = np.array(rows[key].to_pylist(), dtype=float).reshape(length, -1)
+            kinds = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+            stats[key] = {kind: value.tolist() for kind, value in kinds.items()} | {"count": [length]}
+        statistics.append({"episode_index": episode, "stats": stats})
+    for name, lines in (("episodes", episodes), ("episodes_stats", statistics)):
+        (root / "meta" / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return root
+
+
+def files(root):
+    return {path.relative_to(root): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize("form", ["renamed", "blind", "old"])
+def test_a_recording_of_others_trains_resumes_and_is_asked(form, request, tmp_path, capsys):
+    found = request.getfixturevalue(form)
+    before = files(found)
+    cli.main(["prepare", f"--dataset.root={found}", f"--output={tmp_path / 'data'}"])
+    assert files(found) == before
+    assert str(tmp_path / "data") in capsys.readouterr().out
+    data = ["--dataset.repo_id=me/robot", f"--dataset.root={tmp_path / 'data'}"]
+    flags = ["--policy.type=unimask", "--policy.push_to_hub=false", *SMALL_FLAGS, "--batch_size=4", "--save_freq=2"]
+    commands.check("lerobot-train", *flags, *data, "--steps=2", "--output_dir=run", cwd=tmp_path)
+    config = "--config_path=run/checkpoints/last/pretrained_model/train_config.json"
+    commands.check("lerobot-train", config, "--resume=true", "--steps=4", cwd=tmp_path)
+    policy = UniMASKPolicy.from_pretrained(tmp_path / "run")
+    assert int(policy.updates) == 4
+    assert policy.statistics.fps.item() == 30
+    assert policy.statistics.horizon.item() == max(LENGTHS)
+    assert policy.number_names["a"] == JOINTS
+    dataset = open_dataset(policy.config, tmp_path / "data")
+    window = policy.make_window(read_window(dataset, 1))
+    expected = np.stack([waves(1, step) for step in range(10)])
+    np.testing.assert_allclose(window.values["s"][0], expected, atol=1e-5)
+    reply = query.ask(policy, "a[0] | s[0]", batch=read_window(dataset, 1))
+    assert {row["factor"] for row in query.rows(policy, reply)} == {"a"}
+    picture = query.picture(policy, "a[0] | s[0]", reply)
+    assert picture.axes[0].get_ylabel().startswith("a")
+
+
+def test_without_an_output_it_says_what_it_would_do_and_why(renamed, blind, old, capsys):
+    for root, words in (
+        (renamed, ["--rename state=observation.state", "--rename actions=action", "(2, 1)", "nested"]),
+        (blind, ["--drop observation.images.front"]),
+        (old, ["v2.1", "v3.0"]),
+    ):
+        before = files(root)
+        cli.main(["prepare", f"--dataset.root={root}"])
+        said = capsys.readouterr().out
+        assert [word for word in words if word not in said] == []
+        assert files(root) == before
+
+
+def test_joint_names_are_kept(renamed, blind, tmp_path):
+    made = prepare(renamed, make_plan(renamed), output=tmp_path / "made")
+    features = json.loads((made / "meta" / "info.json").read_text())["features"]
+    assert features["action"]["names"] == JOINTS
+    assert features["observation.state"]["shape"] == [2]
+
+
+def test_statistics_are_those_of_the_numbers(renamed, tmp_path):
+    made = prepare(renamed, make_plan(renamed), output=tmp_path / "made")
+    values = np.concatenate([[waves(e, t) for t in range(n)] for e, n in enumerate(LENGTHS)])
+    stats = json.loads((made / "meta" / "stats.json").read_text())["observation.state"]
+    np.testing.assert_allclose(stats["mean"], values.mean(0), atol=1e-6)
+    np.testing.assert_allclose(stats["std"], values.std(0), atol=1e-6)
+
+
+@pytest.mark.parametrize(("given", "count"), [("auto", 3), ("5", 5)])
+def test_whole_numbers_become_categories(renamed, tmp_path, given, count):
+    plan = make_plan(renamed, rename={"choice": "action"}, drop=["actions"], categories={"action": given})
+    made = prepare(renamed, plan, output=tmp_path / "made")
+    features = json.loads((made / "meta" / "info.json").read_text())["features"]
+    assert features["action"]["categories"] == [count]
+    assert "actions" not in features
+    item = LeRobotDataset("me/robot", root=made)[4]
+    assert item["action"].dtype == torch.int64
+    assert item["action"].item() == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rename": {"nothing": "action"}}, "nothing"),
+        ({"rename": {"state": "choice"}}, "already"),
+        ({"drop": ["nothing"]}, "nothing"),
+        ({"categories": {"nothing": "auto"}}, "nothing"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_anything_is_written(renamed, changes, words):
+    with pytest.raises(ValueError, match="has") as raised:
+        make_plan(renamed, **changes)
+    assert words in str(raised.value)
+
+
+def test_numbers_that_are_no_choices_are_refused_and_nothing_is_left(renamed, tmp_path):
+    plan = make_plan(renamed, categories={"actions": "auto"})
+    with pytest.raises(ValueError, match="categories count from 0 on"):
+        prepare(renamed, plan, output=tmp_path / "made")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_is_taken_is_left_as_it_was(renamed, tmp_path):
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "thesis.txt").write_text("three years of work")
+    with pytest.raises(FileExistsError):
+        prepare(renamed, make_plan(renamed), output=tmp_path / "made")
+    assert (tmp_path / "made" / "thesis.txt").read_text() == "three years of work"
+
+
+def test_it_replaces_where_it_is_told_to(renamed, tmp_path):
+    copy = shutil.copytree(renamed, tmp_path / "data")
+    cli.main(["prepare", f"--dataset.root={copy}", "--replace=true"])
+    assert make_plan(copy).rename == {}
+    assert list(tmp_path.iterdir()) == [copy]
