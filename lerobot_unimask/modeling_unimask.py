@@ -21,15 +21,16 @@ from lerobot_unimask.asking.acting import act, check_settings, new_memory, obser
 from lerobot_unimask.asking.answers import Answer, answer
 from lerobot_unimask.asking.given import Given
 from lerobot_unimask.asking.memory import RolloutMemory
+from lerobot_unimask.asking.predicting import predict
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
-from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, last_checkpoint, read_weights
+from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, read_weights
 from lerobot_unimask.data.factors import TASK, make_factors
 from lerobot_unimask.data.returns import EpisodeStarts
+from lerobot_unimask.data.soundness import check_loss, check_saved
 from lerobot_unimask.data.taking_over import take_over
 from lerobot_unimask.data.window import Statistics, Window, frame_index, make_window, read_batch, task_column
-from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
 from lerobot_unimask.machine import keep_freed_memory
@@ -148,11 +149,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         Raises:
             FloatingPointError: the loss is no longer finite. The last checkpoint is whole: it was saved before.
         """
-        if self._loss is not None and not self._loss.isfinite():
-            raise FloatingPointError(
-                f"The loss is {self._loss.item()} after {int(self.updates)} updates: training ends here, and the last "
-                "checkpoint is from before. A lower optimizer_lr, or optimizer_grad_clip_norm, may help."
-            )
+        if self._loss is not None:
+            check_loss(self._loss, int(self.updates))
         self.updates += 1
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
@@ -166,34 +164,8 @@ class UniMASKPolicy(PreTrainedPolicy):
     # --- Asking ------------------------------------------------------------------------------------------------------
 
     def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
-        """What the network puts out for each asked token. A token that follows a history shown in full is predicted
-        causally, where the model has learnt that, and every other one in both directions; so a token's answer does not
-        depend on what else is asked.
-
-        Args:
-            window: normalised values.
-            cache: what the rollout that asks has computed before; of a causal prediction that is not computed again.
-
-        Raises:
-            MaskError: the model attends causally alone and has not learnt to answer this.
-        """
-        causally = self.training_masks.answered_causally(mask)
-        if all(torch.equal(causally[name], mask.asked[name]) for name in causally):
-            return self.network(window, mask.shown, True, cache, mask.asked)
-        if self.config.attention == "causal":
-            raise MaskError(
-                "This model attends causally alone. It was trained on "
-                f"{', '.join(self.training_masks.weights)}, and asks for one token given every state and action before "
-                "it. A model of attention=both answers any question.",
-                mask.draw(),
-            )
-        predictions = self.network(window, mask.shown, False, asked=mask.asked)
-        if any(tokens.any() for tokens in causally.values()):
-            for name, outputs in self.network(window, mask.shown, True, asked=causally).items():
-                here = causally[name].unsqueeze(-1)
-                pairs = zip(outputs, predictions[name], strict=True)
-                predictions[name] = [torch.where(here, causal, other) for causal, other in pairs]
-        return predictions
+        """What the network puts out for each asked token; see `asking.predicting.predict`."""
+        return predict(self, window, mask, cache)
 
     def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
         """A LeRobot batch as a window of this model, in the dataset's units; see `data.window.make_window`."""
@@ -359,15 +331,9 @@ class UniMASKPolicy(PreTrainedPolicy):
         """
         config = kwargs.pop("config", None)
         revision = kwargs.pop("revision", None)
-        folder = Path(pretrained_name_or_path)
-        source = str(pretrained_name_or_path)
-        if folder.is_dir():
-            folder = last_checkpoint(folder)
-            source = str(folder)
-        else:
-            names = ("force_download", "token", "cache_dir", "local_files_only")
-            download = {name: kwargs.pop(name) for name in names if name in kwargs}
-            folder = hub.fetch(source, revision=revision, **download)
+        names = ("force_download", "token", "cache_dir", "local_files_only")
+        download = {name: kwargs.pop(name) for name in names if name in kwargs}
+        folder = hub.find_policy(pretrained_name_or_path, revision=revision, **download)
         config = config or read_config(folder)
         config.validate_features()
         with torch.device("meta"):
@@ -378,7 +344,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         before = {name: value.clone() for name, value in policy.statistics.state_dict().items()}
         policy._read_dataset(dataset_stats, dataset_meta)
         policy.statistics.warn_of_difference(before)
-        policy.origin, policy.folder = hub.Origin(source, hub.commit_of(folder)), folder
+        source = folder if Path(pretrained_name_or_path).is_dir() else pretrained_name_or_path
+        policy.origin, policy.folder = hub.Origin(str(source), hub.commit_of(folder)), folder
         return policy
 
     def describe_origin(self) -> dict[str, Any]:
@@ -392,9 +359,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         Raises:
             FloatingPointError: a weight is not finite.
         """
-        broken = [name for name, tensor in self.state_dict().items() if not tensor.isfinite().all()]
-        if broken:
-            raise FloatingPointError(f"{broken[0]} holds numbers that are not finite, so nothing has been saved.")
+        check_saved(self.state_dict())
         super()._save_pretrained(save_directory, state_dict=state_dict)
         for pipeline in make_unimask_pre_post_processors(self.config):
             pipeline.save_pretrained(save_directory)

@@ -35,6 +35,7 @@ FLOORS = [
     "lerobot_unimask/networks/decision_transformer.py",
     "lerobot_unimask/networks/transformer.py",
     "lerobot_unimask/networks/__init__.py",
+    "lerobot_unimask/asking/predicting.py",
     "lerobot_unimask/asking/answers.py",
     "lerobot_unimask/asking/given.py",
     "lerobot_unimask/asking/memory.py",

@@ -133,8 +133,6 @@ def is_numeric(entry: dict[str, Any]) -> bool:
 def read_feature(key: str, entry: dict[str, Any]) -> Feature:
     size = entry["shape"][0] if entry["shape"] else 1
     categories = entry.get("categories", [2] * size if entry["dtype"] == "bool" else None)
-    if categories is not None and len(categories) != size:
-        raise ValueError(f"{key} has {size} numbers and {len(categories)} categories in the dataset's info.json.")
     names = flat_names(entry.get("names"))
     return Feature(
         key, size, list(categories) if categories is not None else None, names if len(names) == size else None

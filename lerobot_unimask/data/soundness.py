@@ -1,4 +1,4 @@
-"""Whether a dataset's numbers are sound: what is not finite is found before it is trained on, and said where it stands.
+"""Whether numbers are sound, a dataset's, a loss, weights: what is not finite is found and said where it stands.
 
 Shapes: N frames, D numbers of a column.
 """
@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.utils.constants import HF_LEROBOT_HOME
+from torch import Tensor
 
 SEEN = HF_LEROBOT_HOME / "unimask" / "sound"  # markers of datasets that have been looked through
 
@@ -97,3 +98,25 @@ def compute_statistics(root: Path, key: str) -> dict[str, np.ndarray]:
         raise ValueError(f"The dataset's statistics lack {key!r}, and it is no column of numbers in {root / 'data'}.")
     values = np.concatenate(parts).astype(np.float64)
     return {"mean": values.mean(0), "std": values.std(0)}
+
+
+def check_loss(loss: Tensor, updates: int) -> None:
+    """
+    Raises:
+        FloatingPointError: the loss is no longer finite. The last checkpoint is whole: it was saved before.
+    """
+    if not loss.isfinite():
+        raise FloatingPointError(
+            f"The loss is {loss.item()} after {updates} updates: training ends here, and the last checkpoint is from "
+            "before. A lower optimizer_lr, or optimizer_grad_clip_norm, may help."
+        )
+
+
+def check_saved(weights: Mapping[str, Tensor]) -> None:
+    """
+    Raises:
+        FloatingPointError: a weight is not finite.
+    """
+    broken = [name for name, tensor in weights.items() if not tensor.isfinite().all()]
+    if broken:
+        raise FloatingPointError(f"{broken[0]} holds numbers that are not finite, so nothing has been saved.")

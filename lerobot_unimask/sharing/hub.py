@@ -30,6 +30,7 @@ from huggingface_hub.file_download import repo_folder_name
 from lerobot.datasets.utils import get_safe_version
 from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
+from lerobot_unimask.data.checkpoints import last_checkpoint
 from lerobot_unimask.records import read_json
 
 
@@ -42,6 +43,12 @@ class Origin(NamedTuple):
 
     repository: str
     revision: str | None
+
+
+def find_policy(name_or_path: str | Path, *, revision: str | None = None, **download: Any) -> Path:
+    """The folder of a policy's files: of a checkpoint, of a training's last one, or of what `fetch` gets."""
+    folder = Path(name_or_path)
+    return last_checkpoint(folder) if folder.is_dir() else fetch(str(name_or_path), revision=revision, **download)
 
 
 def fetch(repo_id: str, *, revision: str | None = None, **download: Any) -> Path:
