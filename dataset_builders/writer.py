@@ -15,7 +15,7 @@ import shlex
 import shutil
 import sys
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def write_dataset(
     features: Mapping[str, dict],
     columns: Mapping[str, np.ndarray],
     lengths: np.ndarray,
-    task: str,
+    task: str | Sequence[str],
     robot_type: str,
     provenance: Mapping[str, Any],
     progress: bool = False,
@@ -65,7 +65,7 @@ def write_dataset(
         columns: The same keys -> (N, D) arrays of those dtypes, episodes one after another. LeRobot's own columns
             (timestamp, frame_index, episode_index, index, task_index) are added.
         lengths: (E,) steps in each episode; they sum to N.
-        task: The one task of all episodes, in words.
+        task: The task in words: one text, or one for each episode.
         robot_type: What acted.
         provenance: How the data came about, for `meta/provenance.json` (info.json keeps no unknown keys); the package's
             version and the command line are added.
@@ -86,11 +86,13 @@ def write_dataset(
         meta = LeRobotDatasetMetadata.create(
             repo_id=repo_id, fps=fps, features=dict(features), robot_type=robot_type, root=partial
         )
-        meta.save_episode_tasks([task])
+        tasks = [task] * len(lengths) if isinstance(task, str) else list(task)
+        meta.save_episode_tasks(list(dict.fromkeys(tasks)))
         columns = {**columns, **_default_columns(lengths, fps)}
+        columns["task_index"] = np.repeat(meta.tasks.loc[tasks, "task_index"].to_numpy(), lengths)[:, None]
         bar = tqdm(total=len(columns) + 3, desc=f"Writing {root.name}", unit="part", disable=None if progress else True)
         with bar:
-            _write_all(meta, columns, lengths, task, bar)
+            _write_all(meta, columns, lengths, tasks, bar)
         _write_provenance(partial, provenance)
         _finish_info(meta, lengths)
         with contextlib.suppress(FileNotFoundError):
@@ -142,7 +144,6 @@ def _default_columns(lengths: np.ndarray, fps: int) -> dict[str, np.ndarray]:
         "frame_index": frame_index,
         "episode_index": np.repeat(np.arange(len(lengths)), lengths),
         "index": index,
-        "task_index": np.zeros(frames, dtype=np.int64),
     }
     return {name: column[:, None] for name, column in columns.items()}
 
@@ -247,7 +248,7 @@ def dataset_statistics(statistics: EpisodeStatistics) -> dict[str, np.ndarray]:
 
 
 def _write_all(
-    meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray], lengths: np.ndarray, task: str, bar: tqdm
+    meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray], lengths: np.ndarray, tasks: list[str], bar: tqdm
 ) -> None:
     """Statistics, data and episodes; only info.json, which makes it a dataset, still says that it is empty."""
     statistics = {}
@@ -258,7 +259,7 @@ def _write_all(
     bar.update()
     chunk, file = _write_tables(meta, meta.data_path, _data_table(meta, columns), lengths, ROW_GROUP_FRAMES)
     bar.update()
-    episodes = _episode_columns(lengths, task, chunk, file, statistics)
+    episodes = _episode_columns(lengths, tasks, chunk, file, statistics)
     _write_episodes(meta, episodes)
     bar.update()
 
@@ -276,13 +277,17 @@ def _data_table(meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray]) ->
 
 
 def _episode_columns(
-    lengths: np.ndarray, task: str, chunk: np.ndarray, file: np.ndarray, statistics: dict[str, EpisodeStatistics]
+    lengths: np.ndarray,
+    tasks: list[str],
+    chunk: np.ndarray,
+    file: np.ndarray,
+    statistics: dict[str, EpisodeStatistics],
 ) -> dict[str, pa.Array]:
     """meta/episodes' columns, but for those that say which of its files a row is in."""
     ends = np.cumsum(lengths)
     columns = {
         "episode_index": pa.array(np.arange(len(lengths))),
-        "tasks": pa.array([[task]] * len(lengths)),
+        "tasks": pa.array([[task] for task in tasks]),
         "length": pa.array(lengths.astype(np.int64)),
         "data/chunk_index": pa.array(chunk),
         "data/file_index": pa.array(file),

@@ -69,6 +69,18 @@ def test_the_same_seed_builds_the_same(root, tmp_path):
     assert all(torch.equal(one[frame]["action"], other[frame]["action"]) for frame in range(0, len(one), 20))
 
 
+def test_several_tasks_make_one_dataset(root, tmp_path):
+    """Each task's episodes are what it has alone, with room for the most objects, and say what they do."""
+    both = build_metaworld(tmp_path / "both", task=f"{TASK},stick-push-v3", episodes=1, progress=False)
+    alone, dataset = LeRobotDataset("local/arm", root=root), LeRobotDataset("local/arm", root=both)
+    assert [dataset[first]["task"] for first, _ in bounds_of(dataset)] == list(
+        map(describe_task, (TASK, "stick-push-v3"))
+    )
+    assert torch.equal(dataset[0]["action"], alone[0]["action"])
+    assert dataset[0]["observation.environment_state"].shape == (2 * OBJECT + 3,)
+    assert provenance_of(both)["failures"].keys() == {TASK, "stick-push-v3"}
+
+
 def test_it_trains_and_is_evaluated_by_lerobots_loops(root, tmp_path):
     """Videos apart, for which there may be no display."""
     small = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]

@@ -28,11 +28,9 @@ def add(commands: Any) -> None:
     maze2d.add_argument("--maze", default="medium", help="umaze, medium, large, or a maze's own text")
     maze2d.set_defaults(run=_build, settings=("noise", "maze"))
 
-    metaworld = add_command(
-        environments, "metaworld", "a task of MetaWorld for a Sawyer arm, a scripted expert (extra)"
-    )
+    metaworld = add_command(environments, "metaworld", "tasks of MetaWorld for a Sawyer arm, scripted experts (extra)")
     _dataset(metaworld, episodes=100)
-    metaworld.add_argument("--task", required=True, metavar="NAME", help="as in peg-insert-side-v3")
+    metaworld.add_argument("--task", required=True, metavar="NAME", help="as in peg-insert-side-v3, or several: A,B")
     metaworld.add_argument(
         "--noise", type=float, default=0.1, help="standard deviation of the noise on half of the steps"
     )
