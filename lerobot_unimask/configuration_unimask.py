@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -19,12 +19,15 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
 from lerobot_unimask.data.factors import (
     TASK,
+    Camera,
     Feature,
     check_layout,
+    colour_cameras,
     declared_feature,
     describe_features,
     group_features,
     is_numeric,
+    name_cameras,
     read_feature,
 )
 from lerobot_unimask.language.grammar import MAX_CONTEXT
@@ -147,6 +150,14 @@ class UniMASKConfig(PreTrainedConfig):
     dropout: float = 0.1
     """Share of a layer's outputs that training leaves out."""
 
+    vision_backbone: str | None = None
+    """What looks at pictures: a ResNet of torchvision by its name, such as "resnet18"; None: three convolutions, which
+    two processor cores can train."""
+    pretrained_backbone_weights: str | None = None
+    """Weights that the ResNet begins with, torchvision's "ResNet18_Weights.IMAGENET1K_V1" for one; None: drawn."""
+    optimizer_lr_backbone: float | None = None
+    """Learning rate of what looks at pictures; None: optimizer_lr."""
+
     # The loss
     loss_weights: dict[str, float] = field(default_factory=dict)
     """Weight of each factor's loss, {"s": 0.5}; 1 where not named."""
@@ -168,9 +179,20 @@ class UniMASKConfig(PreTrainedConfig):
     properties: list[str] = field(default_factory=list)
     """Columns that label whole episodes, observation.NAME: each is a factor NAME, shown as NAME[0] or not at all."""
 
+    cameras: list[str] | None = None
+    """Columns of pictures that the model reads, such as ["observation.images.top"]; [] reads none, None all that the
+    dataset has, but for depth."""
+    image_size: list[int] = field(default_factory=lambda: [96, 96])
+    """Height and width at which pictures are read."""
+    cache_frames: bool = True
+    """Whether a dataset's pictures are decoded once, at this size, into files under LeRobot's cache folder; False: at
+    each read."""
+
     # Read off the training dataset and saved, so that a checkpoint knows what it was trained on.
     features: dict[str, list[Feature]] = field(default_factory=dict)
     """Factor name -> the dataset's columns that make it up."""
+    pictures: dict[str, Camera] = field(default_factory=dict)
+    """Name of each camera that the model reads -> the dataset's column."""
     dataset_revision: str | None = None
     """Commit on the Hub that the training data are of; None: they were read from a folder."""
     format_version: FormatVersion = FORMAT_VERSION
@@ -227,6 +249,14 @@ class UniMASKConfig(PreTrainedConfig):
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1 to {most}.")
         if self.width % self.heads:
             raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
+        if len(self.image_size) != 2 or not all(1 <= size <= 4096 for size in self.image_size):
+            raise ValueError(
+                f"image_size is {self.image_size}; give height and width, 1 to 4096 pixels each: [96, 96]."
+            )
+        if self.vision_backbone is not None and not self.vision_backbone.startswith("resnet"):
+            raise ValueError(f"vision_backbone is {self.vision_backbone!r}; name a ResNet, such as resnet18, or none.")
+        if self.pretrained_backbone_weights is not None and self.vision_backbone is None:
+            raise ValueError("pretrained_backbone_weights needs vision_backbone: the convolutions have none.")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout is {self.dropout}; it must lie in [0, 1).")
         if isinstance(self.target_return, str) and self.target_return != "auto":
@@ -282,14 +312,40 @@ class UniMASKConfig(PreTrainedConfig):
         found = {key: read_feature(key, entry) for key, entry in dataset_features.items() if is_numeric(entry)}
         check_layout(dataset_features)
         features = group_features(found, self.properties, self.states)
+        pictures = self._named_cameras(dataset_features, features)
         tasks = {name: columns for name, columns in self.features.items() if name == TASK}  # not among the columns
         features |= tasks
-        if self.features and features != self.features:
+        if self.features and (features, pictures) != (self.features, self.pictures):
             raise ValueError(
                 "This checkpoint was trained on other features than the dataset has.\n"
-                f"  checkpoint: {describe_features(self.features)}\n  dataset:    {describe_features(features)}"
+                f"  checkpoint: {describe_features(self.features, self.pictures)}\n"
+                f"  dataset:    {describe_features(features, pictures)}"
             )
-        self.features = features
+        self.features, self.pictures = features, pictures
+
+    def cameras_of(self, dataset_features: dict[str, dict[str, Any]]) -> list[str]:
+        """The columns of pictures that the model reads of a dataset: a checkpoint's own, where there is one.
+
+        Raises:
+            ValueError: a camera that the dataset does not have, or a network that reads none.
+        """
+        colour = list(colour_cameras(dataset_features))
+        wanted = self.cameras
+        if wanted is None:
+            wanted = [camera.key for camera in self.pictures.values()] if self.features else colour
+        for key in wanted:
+            if key not in colour or wanted.count(key) > 1:
+                raise ValueError(
+                    f"The camera {key!r} is not among the dataset's, or named twice; its colour cameras are "
+                    f"{', '.join(colour) or 'none'}."
+                )
+        if wanted and self.network != "transformer":
+            raise ValueError(f"network={self.network} reads no cameras: leave them out with --policy.cameras=[].")
+        return list(wanted)
+
+    def _named_cameras(self, entries: dict[str, dict[str, Any]], taken: Iterable[str]) -> dict[str, Camera]:
+        channels = colour_cameras(entries)
+        return name_cameras({key: channels[key] for key in self.cameras_of(entries)}, self.image_size, list(taken))
 
     def add_tasks(self, texts: Sequence[str]) -> None:
         """Make the task a factor, where the dataset has several."""
@@ -308,6 +364,12 @@ class UniMASKConfig(PreTrainedConfig):
             self.features = group_features(
                 {key: declared_feature(key, feature) for key, feature in sizes.items()}, self.properties, self.states
             )
+            pictures = {
+                key: {"dtype": "image", "shape": list(feature.shape), "names": ["channels", "height", "width"]}
+                for key, feature in declared.items()
+                if len(feature.shape) == 3
+            }
+            self.pictures = self._named_cameras(pictures, self.features)
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ policies.
 import functools
 import logging
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -61,11 +62,14 @@ def _read_as_this_policy_needs() -> None:
     """Streams are refused: LeRobot 0.6.1's fail on windows of a feature of shape (1,), give nothing at all, and wait
     for ever, with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`. And a dataset that
     is read in batches gets no DataLoader workers, of which LeRobot starts four: each imports LeRobot first, some 20 s,
-    for batches that take a millisecond, and from the second epoch on they see another order of the data.
+    for batches that take a millisecond, and from the second epoch on they see another order of the data. Of cameras,
+    those that the policy reads are decoded once, others not at all; LeRobot decodes all of a window's frames of all of
+    them at each read.
 
     Other policies: unchanged.
     """
-    lerobots_make_dataset = factory.make_dataset
+    lerobots_make_dataset, lerobots_make_both = factory.make_dataset, factory.make_train_eval_datasets
+    opened: list[LeRobotDataset] = []  # the last one for this policy
 
     @functools.wraps(lerobots_make_dataset)
     def make_dataset(cfg: TrainPipelineConfig) -> LeRobotDataset:
@@ -79,12 +83,28 @@ def _read_as_this_policy_needs() -> None:
         if cfg.trainable_config.type == "unimask" and cfg.dataset.root and (root / "meta" / "info.json").exists():
             read_info(root)  # a damaged one ends in one sentence
         dataset = lerobots_make_dataset(cfg)
+        if cfg.trainable_config.type == "unimask":
+            opened[:] = [dataset]
+            reads.read_cameras(dataset, cfg.trainable_config)
         if cfg.trainable_config.type == "unimask" and cfg.num_workers and getattr(dataset, "__getitems__", None):
             logger.info("Windows are read in batches, faster than workers start: num_workers=0.")
             cfg.num_workers = 0
         return dataset
 
+    @functools.wraps(lerobots_make_both)
+    def make_train_eval_datasets(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
+        both = lerobots_make_both(cfg)
+        if cfg.trainable_config.type == "unimask" and both[1] is not None:  # opened anew, each with its episodes
+            for part in both:
+                reads.read_cameras(part, cfg.trainable_config, opened[0])
+        opened.clear()
+        return both
+
     factory.make_dataset = make_dataset
+    factory.make_train_eval_datasets = make_train_eval_datasets
+    for name in ("lerobot.datasets", "lerobot.scripts.lerobot_train"):  # where LeRobot has imported it by name
+        if name in sys.modules:
+            sys.modules[name].make_train_eval_datasets = make_train_eval_datasets
 
 
 def _work_offline() -> None:

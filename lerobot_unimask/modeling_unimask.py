@@ -5,7 +5,7 @@ import io
 import logging
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +20,7 @@ from torch import Tensor
 from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_return, observed_state, plan_from
 from lerobot_unimask.asking.answers import Answer, answer
 from lerobot_unimask.asking.given import Given
+from lerobot_unimask.asking.looking import observed_pictures
 from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.predicting import predict
 from lerobot_unimask.asking.questions import pose_question
@@ -37,11 +38,10 @@ from lerobot_unimask.machine import keep_freed_memory
 from lerobot_unimask.networks import make_network
 from lerobot_unimask.networks.layers import Cache, Predictions
 from lerobot_unimask.networks.losses import LossParts, masked_losses
+from lerobot_unimask.networks.vision import parameter_groups
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 from lerobot_unimask.records import read_json
 from lerobot_unimask.sharing import cards, hub
-
-logger = logging.getLogger(__name__)
 
 
 class UniMASKPolicy(PreTrainedPolicy):
@@ -52,6 +52,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         dataset_stats: statistics to normalise with, `LeRobotDatasetMetadata.stats`; without them nothing is scaled
             until a checkpoint is loaded.
         dataset_meta: metadata of the training dataset; its folder holds how each episode began and what it returned.
+        load_backbone: whether pretrained weights of what looks at pictures are fetched; a checkpoint brings its own.
 
     Raises:
         ValueError: the dataset lacks states or actions, or the settings ask for a factor that it does not have.
@@ -66,15 +67,14 @@ class UniMASKPolicy(PreTrainedPolicy):
         config: UniMASKConfig,
         dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
+        load_backbone: bool = True,
     ) -> None:
         super().__init__(config)
         config.validate_features()
         if dataset_meta is not None and TASK not in config.features:
             config.add_tasks(list(dataset_meta.tasks.index))
-        if config.image_features:
-            names = ", ".join(config.image_features)
-            logger.warning("unimask ignores the camera features %s; LeRobot decodes them all the same.", names)
         self.factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
+        self.cameras = config.pictures
         check_settings(config, self.factors)
         self.statistics = Statistics(config.features, self.factors, config.context_length)
         self.episode_starts = EpisodeStarts(self.factors["s"].size)
@@ -84,8 +84,9 @@ class UniMASKPolicy(PreTrainedPolicy):
             tuple(self.factors),
             config.context_length,
             causal_share={"bidirectional": 0.0, "both": config.causal_share, "causal": 1.0}[config.attention],
+            cameras=tuple(self.cameras),
         )
-        self.network = make_network(config, self.factors)
+        self.network = make_network(config, self.factors, load_backbone=load_backbone)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
         self._loss: Tensor | None = None  # of the last batch that was trained on
         self.origin: hub.Origin | None = None  # where it was loaded from
@@ -120,7 +121,7 @@ class UniMASKPolicy(PreTrainedPolicy):
 
         Args:
             batch: `observation.state` (B, K, D), `action` (B, K, D), `observation.return_to_go` (B, K), each with its
-                `*_is_pad` (B, K), `timestamp` (B,) and `index` (B,), as LeRobot's dataset gives them. Not changed.
+                `*_is_pad` (B, K), cameras (B, K, C, H, W), `timestamp` (B,) and `index` (B,). Not changed.
             reduction: "mean"; or "none" for each window's part, which lerobot-train weights with --sample_weighting.
 
         Returns:
@@ -158,8 +159,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         linear = r"query_key_value|project|feedforward\.[02]|hidden\.\d+\.0|numbers|returns|stack|heads\.\w+"
         return {"target_modules": rf"network\.(.*\.)?({linear})"}
 
-    def get_optim_params(self) -> Iterator[torch.nn.Parameter]:
-        return self.parameters()
+    def get_optim_params(self) -> Iterable[torch.nn.Parameter] | list[dict[str, Any]]:
+        return parameter_groups(self, self.config.optimizer_lr_backbone)
 
     # --- Asking ------------------------------------------------------------------------------------------------------
 
@@ -172,12 +173,13 @@ class UniMASKPolicy(PreTrainedPolicy):
         if TASK in self.factors and TASK in batch:
             batch = {**batch, TASK: task_column(batch[TASK], self.factors[TASK], self.config.context_length)}
         return make_window(
-            read_batch(batch, self.config.features, self.device),
+            read_batch(batch, self.config.features, self.device, self.cameras),
             self.config.features,
             self.config.context_length,
             horizon=self.statistics.horizon,
             fps=self.statistics.fps,
             partial=partial,
+            cameras=self.cameras,
         )
 
     @torch.no_grad()
@@ -262,9 +264,9 @@ class UniMASKPolicy(PreTrainedPolicy):
         """One action for each environment: the answer to the inference mask at the present step.
 
         Args:
-            batch: `observation.state` (B, D) of this step; `observation.return_so_far` (B, 1) where a return is asked
-                for and the episode is longer than the window; `task`, a text or (B,) of them, where the model has
-                several. Not changed.
+            batch: `observation.state` (B, D) of this step; cameras (B, C, H, W), from 0 to 1, where the model has any;
+                `observation.return_so_far` (B, 1) where a return is asked for and the episode is longer than the
+                window; `task`, a text or (B,) of them, where the model has several. Not changed.
             mask: question of this step, instead of `inference_mask`. While actions of a chunk are left, none is put.
             given: values of single tokens, instead of the config's: of positions in the window, `s[-1]`, or of steps
                 of the episode, `s@150`. What has been observed wins over them.
@@ -284,7 +286,8 @@ class UniMASKPolicy(PreTrainedPolicy):
             self._memory = new_memory(self, len(state))
         question = {"mask": mask, "given": given, "sample": sample, "generator": generator}
         with _evaluation(self):
-            return act(self, self._memory, state, so_far, batch.get(TASK), **question)
+            pictures = observed_pictures(self, batch, len(state))
+            return act(self, self._memory, state, so_far, pictures, batch.get(TASK), **question)
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -298,7 +301,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         any time; for arguments see `asking.acting.plan_from`."""
         how = {"inference_delay": inference_delay, "left_over": prev_chunk_left_over, **kwargs}
         with _evaluation(self):
-            return plan_from(self, observed_state(self, batch), batch.get(TASK), **how)
+            state = observed_state(self, batch)
+            return plan_from(self, state, observed_pictures(self, batch, len(state)), batch.get(TASK), **how)
 
     def supports_rtc(self) -> bool:
         """Whether LeRobot may act by real-time chunking: there is more than one action to a chunk."""
@@ -337,7 +341,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         config = config or read_config(folder)
         config.validate_features()
         with torch.device("meta"):
-            network = make_network(config, make_factors(config.features, gaussian=config.continuous_head == "gaussian"))
+            factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
+            network = make_network(config, factors, load_backbone=False)
         check_header(folder / WEIGHTS, network.state_dict(prefix="network."))
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)

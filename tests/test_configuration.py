@@ -227,7 +227,7 @@ def test_what_cannot_be_a_property_is_refused(properties, message):
 
 @pytest.mark.parametrize("name", ["s", "a", "t", "rtg"])
 def test_the_names_of_the_language_are_taken(name):
-    with pytest.raises(ValueError, match="s, a, t, rtg, task and other properties' names are taken"):
+    with pytest.raises(ValueError, match="s, a, t, rtg, state, task and other properties' names are taken"):
         with_properties(f"observation.{name}", features={**LABELLED, f"observation.{name}": CORNER})
 
 

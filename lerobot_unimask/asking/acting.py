@@ -9,7 +9,7 @@ Legend of shapes: B environments, K steps, D the numbers of a factor, H actions 
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -25,10 +25,11 @@ from lerobot_unimask.asking.given import (
     read_given,
     text_of,
 )
+from lerobot_unimask.asking.looking import LookingModel, look_at_given
 from lerobot_unimask.asking.memory import NO_RETURN_SO_FAR, RolloutMemory
 from lerobot_unimask.asking.sampling import sample as draw_jointly
 from lerobot_unimask.configuration_unimask import UniMASKConfig
-from lerobot_unimask.data.factors import RETURN_SO_FAR, TASK, Factor, category_numbers
+from lerobot_unimask.data.factors import RETURN_SO_FAR, TASK, Camera, Factor, category_numbers
 from lerobot_unimask.data.returns import EpisodeStarts
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.grammar import MaskError
@@ -37,12 +38,11 @@ from lerobot_unimask.language.masks import Mask, MaskTable, Token, tabulate
 logger = logging.getLogger(__name__)
 
 
-class ActingModel(Model):
+class ActingModel(Model, LookingModel, Protocol):
     """A model with its config and what it keeps of its training episodes."""
 
     config: UniMASKConfig
     episode_starts: EpisodeStarts
-    device: torch.device
 
 
 def act(
@@ -50,6 +50,7 @@ def act(
     memory: RolloutMemory,
     state: Tensor,
     return_so_far: Tensor | None,
+    pictures: Mapping[str, Tensor],
     task: str | Sequence[str] | None,
     **question: Any,
 ) -> Tensor:
@@ -58,6 +59,7 @@ def act(
     Args:
         state: (B, D) of the present step, as `observed_state` reads it.
         return_so_far: (B,) rewards received before it, as `observed_return` reads it.
+        pictures: camera -> (B, width), tokens of its pictures, as `observed_pictures` makes them.
         task: text of each environment's, or of all, where they say one.
         question: `mask`, `given`, `sample` and `generator`, as `UniMASKPolicy.select_action` takes them.
 
@@ -65,7 +67,7 @@ def act(
         (B, D) in the dataset's units.
     """
     memory.task = task
-    memory.observe(state, return_so_far)
+    memory.observe(state, return_so_far, pictures)
     if not memory.planned:
         actions = plan(model, memory, **question)
         memory.planned = list(actions[:, : model.config.n_action_steps].unbind(1))
@@ -77,6 +79,7 @@ def act(
 def plan_from(
     model: ActingModel,
     state: Tensor,
+    pictures: Mapping[str, Tensor],
     task: str | Sequence[str] | None,
     *,
     inference_delay: int = 0,
@@ -91,6 +94,7 @@ def plan_from(
 
     Args:
         state: (B, D) of the present step.
+        pictures: camera -> (B, width), tokens of its pictures.
         task: text of each environment's, or of all, where they say one.
         inference_delay: number of actions of `left_over` that will be done by the time the chunk is there.
         left_over: (T, D) actions of the chunk before that are still to be carried out, the next one first; rows of
@@ -105,7 +109,7 @@ def plan_from(
     """
     memory = new_memory(model, len(state))
     memory.task = task
-    memory.observe(state, torch.zeros(len(state), device=model.device))
+    memory.observe(state, torch.zeros(len(state), device=model.device), pictures)
     prefix = _on_their_way(model, inference_delay, left_over)
     return as_action(model, plan(model, memory, prefix=prefix, **question))
 
@@ -142,15 +146,15 @@ def plan(
         prefix: (B, d, D) actions that are on their way already: shown, and returned as they are.
     """
     config, present = model.config, memory.position
-    table = acting_table(config.inference_mask if mask is None else mask, model.factors, config.context_length)
+    text = config.inference_mask if mask is None else mask
+    table = acting_table(text, model.factors, config.context_length, model.cameras)
     text = table.question.text
-    tokens = read_given(
-        config.given if given is None else given, model.factors, config.context_length, len(memory.valid)
-    )
+    given_here = config.given if given is None else given
+    tokens = read_given(given_here, model.factors, config.context_length, len(memory.valid), model.cameras)
     if given is not None:  # the config's may go unused by a question that is asked in passing
         check_shown(tokens, table.shows, text)
     horizon = int(model.statistics.horizon)
-    here = in_window(tokens, memory.first_step, config.context_length, horizon)
+    here = in_window(look_at_given(model, tokens), memory.first_step, config.context_length, horizon)
     if TASK in model.factors and table.shows[TASK][0] and (TASK, 0) not in here and memory.task is not None:
         here[TASK, 0] = torch.tensor(category_numbers(memory.task, model.factors[TASK]))
     if "rtg" in model.factors and table.shows["rtg"][0]:
@@ -200,16 +204,19 @@ def new_memory(model: ActingModel, batch_size: int) -> RolloutMemory:
     config = model.config
     remembered = config.n_obs_steps or config.context_length
     last_position = min(remembered - 1, config.context_length - config.chunk_size)
-    return RolloutMemory(model.factors, config.context_length, batch_size, model.device, last_position)
+    cameras = dict.fromkeys(model.cameras, config.width)
+    return RolloutMemory(model.factors, config.context_length, batch_size, model.device, last_position, cameras)
 
 
-def acting_table(text: str, factors: Mapping[str, Factor], context_length: int) -> MaskTable:
+def acting_table(
+    text: str, factors: Mapping[str, Factor], context_length: int, cameras: Mapping[str, Camera]
+) -> MaskTable:
     """The table of a question that a rollout can ask at every step.
 
     Raises:
         MaskError: it does not ask for a[t].
     """
-    table = tabulate(text, tuple(factors), context_length)
+    table = tabulate(text, tuple(factors), context_length, tuple(cameras))
     if not table.acts:
         raise MaskError(
             "A mask for a rollout asks for a[t] at every step, as 'a[t] | s[:t+1], a[:t]' does.",
@@ -290,8 +297,8 @@ def check_settings(config: UniMASKConfig, factors: Mapping[str, Factor]) -> None
             f"target_return is {config.target_return}, but this model has no return factor: its dataset has "
             "no 'observation.return_to_go'."
         )
-    table = acting_table(config.inference_mask, factors, config.context_length)
-    tokens = list(read_given(config.given, factors, config.context_length))
+    table = acting_table(config.inference_mask, factors, config.context_length, config.pictures)
+    tokens = list(read_given(config.given, factors, config.context_length, cameras=config.pictures))
     if config.target_return is not None:
         if Token("rtg", 0) in tokens:
             raise ValueError("target_return and given both name rtg[0]; give one of them.")

@@ -1,16 +1,20 @@
-"""Values that a user gives for single tokens of a window, `{"s[-1]": [15, 15], "rtg[0]": 5}`, read and checked.
+"""Values that a user gives for single tokens of a window, `{"s[-1]": [15, 15], "rtg[0]": 5, "top[-1]": "goal.png"}`,
+read and checked.
 
-Legend of shapes: B windows or environments, K steps, D the numbers of a factor.
+Legend of shapes: B windows or environments, K steps, D the numbers of a factor; C channels, H and W pixels.
 """
 
 import reprlib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
-from lerobot_unimask.data.factors import Factor, category_numbers
+from lerobot_unimask.data.factors import Camera, Factor, category_numbers
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.masks import Mask, Token, parse_token
 
@@ -19,27 +23,36 @@ Given = Mapping[str, Any]  # token text -> its value, shared (D,) or one per env
 
 
 def read_given(
-    given: Given, factors: Mapping[str, Factor], context_length: int, batch_size: int | None = None
+    given: Given,
+    factors: Mapping[str, Factor],
+    context_length: int,
+    batch_size: int | None = None,
+    cameras: Mapping[str, Camera] | None = None,
 ) -> dict[Token, Tensor]:
-    """Check what a user gives: token -> (B, D) or (1, D), D as the user counts it, without computed parts.
+    """Check what a user gives: token -> (B, D) or (1, D), D as the user counts it, without computed parts; for a camera
+    (B, C, H, W) or (1, C, H, W).
 
     Args:
         batch_size: B; None where it is not known yet, and any number of rows will do.
 
     Raises:
         MaskError: a key that is not a token.
-        ValueError: a value of the wrong size, not finite, or not one of the categories.
+        ValueError: a value of the wrong size, not finite, or not one of the categories; no picture.
     """
+    cameras = cameras or {}
     if not isinstance(given, Mapping):
         raise ValueError(f'given is {text_of(given)}; give values by token, as in {{"s[-1]": [15, 15], "rtg[0]": 5}}.')
     tokens: dict[Token, Tensor] = {}
     for text, value in given.items():
         if not isinstance(text, str):
             raise ValueError(f"given names {text_of(text)}; name a token by its text, as in 's[-1]'.")
-        token = parse_token(text, tuple(factors), context_length)
+        token = parse_token(text, tuple(factors), context_length, tuple(cameras))
         if token in tokens:
             raise ValueError(f"{token} is given twice, the second time as {text}.")
-        tokens[token] = _token(text, value, factors[token.factor], batch_size)
+        if token.factor in cameras:
+            tokens[token] = _picture(text, value, cameras[token.factor], batch_size)
+        else:
+            tokens[token] = _token(text, value, factors[token.factor], batch_size)
     return tokens
 
 
@@ -102,6 +115,42 @@ def _token(text: str, value: Any, factor: Factor, B: int | None) -> Tensor:
         raise ValueError(f"{text} is given {text_of(value)}; give {numbers}, or one such row for {each}.")
     check_values(f"{text} is given {text_of(value)}, which", token, factor)
     return token
+
+
+def _picture(text: str, value: Any, camera: Camera, B: int | None) -> Tensor:
+    """A picture's path, or an array or tensor, colours first or last, one or one for each of B: (B or 1, C, H, W)."""
+    channels = camera.shape[0]
+    if isinstance(value, str | Path):
+        try:
+            with Image.open(value) as picture:
+                value = np.array(picture.convert("L" if channels == 1 else "RGB"))
+        except OSError as error:
+            raise ValueError(
+                f"{text} is given {str(value)!r}, which is no picture that can be read: {error}"
+            ) from error
+        value = value.reshape(*value.shape[:2], -1)
+    pictures = as_tensor(text, value)
+    pictures = pictures.unsqueeze(0) if pictures.ndim == 3 else pictures
+    if pictures.ndim == 4 and pictures.shape[1] != channels and pictures.shape[-1] == channels:
+        pictures = pictures.permute(0, 3, 1, 2)
+    if pictures.ndim != 4 or pictures.shape[1] != channels or len(pictures) not in (1, B or len(pictures)):
+        raise ValueError(
+            f"{text} is given an array of shape {tuple(as_tensor(text, value).shape)}; give a picture's path, or a "
+            f"picture ({channels}, height, width), or one for each window or environment."
+        )
+    check_picture(f"The picture given as {text}", pictures)
+    return pictures
+
+
+def check_picture(what: str, pictures: Tensor) -> None:
+    """
+    Raises:
+        ValueError: they are neither uint8 nor numbers from 0 to 1.
+    """
+    if pictures.dtype != torch.uint8 and (
+        not pictures.is_floating_point() or not ((pictures >= -1e-3) & (pictures <= 1 + 1e-3)).all()
+    ):
+        raise ValueError(f"{what} is {pictures.dtype} and not uint8, or holds other numbers than those from 0 to 1.")
 
 
 def text_of(value: Any) -> str:

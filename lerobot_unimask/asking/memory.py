@@ -24,6 +24,7 @@ class RolloutMemory:
         context_length: K.
         batch_size: B.
         last_position: position where the present stops, K - 1 or less; None: K - 1.
+        cameras: name of each camera -> numbers of the token that stands for its picture.
     """
 
     @torch.inference_mode(False)
@@ -34,12 +35,15 @@ class RolloutMemory:
         batch_size: int,
         device: torch.device,
         last_position: int | None = None,
+        cameras: Mapping[str, int] | None = None,
     ):
         K = context_length
         self.last_position = K - 1 if last_position is None else last_position
         self.step = -1  # of the episode; nothing has been observed yet
         self.acted = True  # the step has ended, so that the next observation begins another
-        self.values = {name: torch.zeros(batch_size, K, factor.size, device=device) for name, factor in factors.items()}
+        self.cameras = tuple(cameras or {})
+        sizes = {name: factor.size for name, factor in factors.items()} | dict(cameras or {})
+        self.values = {name: torch.zeros(batch_size, K, size, device=device) for name, size in sizes.items()}
         self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
         self.first_state: Tensor | None = None  # (B, D)
         self.task: str | Sequence[str] | None = None  # what each environment is to do, as it says at this step
@@ -58,15 +62,18 @@ class RolloutMemory:
         return self.step - self.position
 
     @torch.inference_mode(False)  # LeRobot acts in inference mode; what is remembered outlives it
-    def observe(self, state: Tensor, return_so_far: Tensor | None) -> None:
-        """Begin a step: (B, D) of `s`, and (B,) the rewards received so far, where the environment reports them.
+    def observe(
+        self, state: Tensor, return_so_far: Tensor | None, pictures: Mapping[str, Tensor] | None = None
+    ) -> None:
+        """Begin a step: (B, D) of `s`, (B,) the rewards received so far, where the environment reports them, and (B,
+        width) of each camera, the token of its picture.
 
         Where the last step found no action, because its question was refused, it begins again.
         """
         if self.acted:
             self.step += 1
             if self.step > self.last_position:
-                for name in ASKABLE:
+                for name in (*ASKABLE, *self.cameras):
                     self.values[name] = self.values[name].roll(-1, dims=1)
                 self.return_so_far = self.return_so_far.roll(-1, dims=1)
                 self.cache = Cache()
@@ -75,6 +82,8 @@ class RolloutMemory:
         if self.step == 0:
             self.first_state = state
         self.values["s"][:, self.position] = state
+        for name in self.cameras:
+            self.values[name][:, self.position] = pictures[name].clone()
         self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
 
     @torch.inference_mode(False)
@@ -84,10 +93,11 @@ class RolloutMemory:
         self.acted = True
 
     def known(self) -> dict[str, Tensor]:
-        """factor -> (K,) bool: states up to the present, actions before it."""
+        """factor -> (K,) bool: states and pictures up to the present, actions before it."""
         steps = torch.arange(self.valid.shape[1])
-        before = {"s": steps <= self.position, "a": steps < self.position}
-        return {name: before.get(name, torch.zeros_like(steps, dtype=torch.bool)) for name in self.values}
+        known = dict.fromkeys(self.values, torch.zeros_like(steps, dtype=torch.bool))
+        known |= dict.fromkeys(("s", *self.cameras), steps <= self.position)
+        return known | {"a": steps < self.position}
 
     def window(self, horizon: Tensor) -> Window:
         """The window as it stands; the return token knows its timestep, its return is for `give` to fill in."""

@@ -21,6 +21,7 @@ from lerobot_unimask.asking.given import (
     read_given,
     text_of,
 )
+from lerobot_unimask.asking.looking import look_at_given, look_at_window
 from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import Mask, tabulate
@@ -36,9 +37,11 @@ def pose_question(
     """The window and mask of a question, on the model's device; see `UniMASKPolicy.infer` for arguments and errors."""
     K = model.config.context_length
     recorded = window is not None
+    cameras = model.cameras
     if window is None:
-        rows = (len(token) for token in read_given({} if given is None else given, model.factors, K).values())
-        empty = RolloutMemory(model.factors, K, max(rows, default=1), model.device)
+        tokens = read_given({} if given is None else given, model.factors, K, cameras=cameras)
+        width = dict.fromkeys(cameras, model.config.width)
+        empty = RolloutMemory(model.factors, K, max(map(len, tokens.values()), default=1), model.device, cameras=width)
         window = empty.window(model.statistics.horizon)
         empty.carry_return(window)
     elif not isinstance(window, Window):
@@ -51,25 +54,28 @@ def pose_question(
         if mask.causal is not False:
             raise ValueError("A question's direction follows from what it asks: leave out the Mask's `causal`.")
         text = mask.draw()
+        hidden = {name: torch.zeros_like(window.valid) for name in cameras}
+        mask = Mask(hidden | mask.shown, hidden | mask.asked)
     else:
-        table = tabulate(mask, tuple(model.factors), K)
+        table = tabulate(mask, tuple(model.factors), K, tuple(cameras))
         text, mask = table.question.text, table.at(None if t is None else step_number(t), batch_size)
     mask = mask.to(model.device).within(window.valid)
-    tokens = read_given({} if given is None else given, model.factors, K, batch_size)
+    tokens = read_given({} if given is None else given, model.factors, K, batch_size, cameras)
     for token in tokens:
         if token.of_episode:
             raise ValueError(f"{token} is a moment of an episode, for rollouts; here name one of the window, s[3].")
+    window = look_at_window(model, window, mask.shown)
     known = {}
     for name, value in window.values.items():
         lacking = mask.shown[name] & value.isnan().any(-1)  # as in a sample, or a column that is not there
         known[name] = torch.full((K,), recorded) & ~lacking.any(0).cpu()
     for token in tokens:  # here the user changes a recorded window on purpose
         known[token.factor][token.step] = False
-    window, known = give(window, in_window(tokens, 0, K), known)
+    window, known = give(window, in_window(look_at_given(model, tokens), 0, K), known)
     check_shown(tokens, mask.shown, text)
     check_known(mask, known, text)
-    for name, value in window.values.items():
-        check_values(f"A shown token of {name}", value[mask.shown[name]], model.factors[name])
+    for name, factor in model.factors.items():
+        check_values(f"A shown token of {name}", window.values[name][mask.shown[name]], factor)
     return window, mask
 
 

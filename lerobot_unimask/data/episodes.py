@@ -9,13 +9,13 @@ from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any
 
-from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from lerobot_unimask.data.reads import read_cameras
 from lerobot_unimask.records import read_json
 
 MAX_FPS = 1_000_000
@@ -95,9 +95,9 @@ def _is_inner_path(text: Any) -> bool:
 
 
 def open_dataset(
-    config: PreTrainedConfig, root: Path | None, repo_id: str | None = None, *, episodes: list[int] | None = None
+    config: Any, root: Path | None, repo_id: str | None = None, *, episodes: list[int] | None = None
 ) -> LeRobotDataset:
-    """A dataset whose items are windows of a policy with this config.
+    """A dataset whose items are windows of a policy with this `UniMASKConfig`, its cameras those that it reads.
 
     Args:
         root: the dataset's folder; None: the Hub's cache, by `repo_id`.
@@ -111,7 +111,9 @@ def open_dataset(
     repo_id = repo_id or LOCAL
     meta = LeRobotDatasetMetadata(repo_id, root=root)
     deltas = resolve_delta_timestamps(config, meta)
-    return LeRobotDataset(repo_id, root=root, delta_timestamps=deltas, episodes=episodes)
+    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=deltas, episodes=episodes, return_uint8=True)
+    read_cameras(dataset, config)
+    return dataset
 
 
 def bounds_of(dataset: LeRobotDataset) -> list[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""A dataset's columns -> the factors of the mask language: `s`, `a`, `rtg` and the properties."""
+"""A dataset's columns -> the factors of the mask language: `s`, `a`, `rtg`, the properties and the cameras."""
 
 import logging
 import re
@@ -41,6 +41,18 @@ class Feature:
         for count in self.categories or []:
             if not 1 <= count <= MAX_SIZE:
                 raise ValueError(f"{self.key} has {count} categories; each number has 1 to {MAX_SIZE}.")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A column of pictures that the model reads, as the checkpoint's config stores it."""
+
+    key: str
+    shape: list[int]  # channels, height and width, as the model reads them
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or not all(1 <= size <= MAX_SIZE for size in self.shape):
+            raise ValueError(f"{self.key} has shape {self.shape}; a picture has channels, a height and a width.")
 
 
 @dataclass(frozen=True)
@@ -224,20 +236,59 @@ def group_features(
         if (
             not key.startswith(OBS_PREFIX)
             or not re.fullmatch(r"[A-Za-z_]\w*", name)
-            or name in ("t", "rtg", TASK, *features)
+            or name in ("t", "rtg", "state", TASK, *features)
         ):
             raise ValueError(
                 f"{key!r} cannot be a property: it is named observation.NAME, NAME is letters, digits and "
-                f"underscores, and s, a, t, rtg, task and other properties' names are taken."
+                f"underscores, and s, a, t, rtg, state, task and other properties' names are taken."
             )
         features[name] = [found[key]]
     return features
 
 
-def describe_features(features: dict[str, list[Feature]]) -> str:
-    kinds = (
+def colour_cameras(entries: Mapping[str, dict[str, Any]]) -> dict[str, int]:
+    """A dataset's columns of pictures, without those that measure depth -> their number of channels."""
+    found = {}
+    for key, entry in entries.items():
+        info = {**(entry.get("video_info") or {}), **(entry.get("info") or {})}
+        depth = info.get("is_depth_map") or info.get("video.is_depth_map")
+        if entry["dtype"] in ("image", "video") and not depth:
+            names = list(entry.get("names") or ["height", "width", "channels"])
+            channels = next((axis for axis, name in enumerate(names) if name in ("channel", "channels")), 2)
+            found[key] = entry["shape"][channels]
+    return found
+
+
+def name_cameras(channels: Mapping[str, int], size: Sequence[int], taken: Sequence[str]) -> dict[str, Camera]:
+    """Cameras by their names in the mask language: `top` for `observation.images.top`, `images_top` where that is
+    another factor's name.
+
+    Args:
+        channels: column -> number of its pictures' channels.
+        size: height and width at which they are read.
+        taken: names of the other factors.
+
+    Raises:
+        ValueError: a camera for which no name is left.
+    """
+    cameras: dict[str, Camera] = {}
+    for key, count in channels.items():
+        parts = key.removeprefix(OBS_PREFIX).split(".")
+        for n in range(1, len(parts) + 1):
+            name = re.sub(r"\W", "_", "_".join(parts[-n:]))
+            name = name if re.match(r"[A-Za-z_]", name) else f"camera_{name}"
+            if name not in (*taken, *cameras, "t", "s", "a", "state", "rtg", TASK):
+                break
+        else:
+            raise ValueError(f"{key!r} has a name that another factor has: leave it out with --policy.cameras.")
+        cameras[name] = Camera(key, [count, *size])
+    return cameras
+
+
+def describe_features(features: dict[str, list[Feature]], cameras: Mapping[str, Camera]) -> str:
+    kinds = [
         f"{name} = {f.key} ({f.size} numbers{f', categories {f.categories}' if f.categories else ''})"
         for name, columns in features.items()
         for f in columns
-    )
-    return "; ".join(kinds)
+    ]
+    return "; ".join([*kinds, *(f"{name} = {c.key} ({' x '.join(map(str, c.shape))})" for name, c in cameras.items())])

@@ -126,7 +126,7 @@ def _build(dataset: LeRobotDataset, key: str, shape: tuple[int, ...], path: Path
                 if stopped.is_set():
                     return
                 rows = range(first, min(first + CHUNK, end))
-                pictures[rows.start : rows.stop] = _decode(dataset, key, episode, rows, shape[-2:]).numpy()
+                pictures[rows.start : rows.stop] = _decode(dataset, key, episode, rows, (shape[-2], shape[-1])).numpy()
                 bar.update(len(rows))
             with lock:
                 pictures.flush()  # on the disk before it is called done

@@ -13,7 +13,7 @@ import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import datasets
@@ -164,8 +164,57 @@ def _read_columns(hf_dataset: datasets.Dataset, meta: LeRobotDatasetMetadata) ->
 _columns: WeakKeyDictionary[datasets.Dataset, Columns | None] = WeakKeyDictionary()
 
 
+@dataclass(frozen=True)
+class Rows:
+    """Some frames of a camera, in another order, without copying them."""
+
+    frames: np.ndarray  # (N, C, H, W)
+    rows: np.ndarray
+
+    def __getitem__(self, index: np.ndarray) -> np.ndarray:
+        return self.frames[self.rows[index]]
+
+
 # The frames of each dataset's cameras that a policy reads, by key: (N, C, H, W) uint8 each.
-_frames: WeakKeyDictionary[LeRobotDataset, dict[str, np.ndarray]] = WeakKeyDictionary()
+_frames: WeakKeyDictionary[LeRobotDataset, Mapping[str, np.ndarray | Rows]] = WeakKeyDictionary()
+
+
+class ReadsCameras(Protocol):
+    """Settings of a policy that reads some of a dataset's cameras."""
+
+    image_size: list[int]
+    cache_frames: bool
+
+    def cameras_of(self, dataset_features: dict[str, dict[str, Any]]) -> list[str]: ...
+
+
+def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobotDataset | None = None) -> None:
+    """From here on the dataset has the cameras that a policy reads, and decodes no others; their frames are cached
+    where the settings say so.
+
+    Args:
+        whole: dataset with more episodes of the same folder whose frames are cached already.
+
+    Raises:
+        ValueError, OSError: what `cached_frames` and `cameras_of` raise.
+    """
+    if not dataset.meta.camera_keys:
+        return
+    wanted = settings.cameras_of(dataset.meta.features)
+    hf_dataset = dataset.hf_dataset
+    unread = [key for key in dataset.meta.camera_keys if key not in wanted]
+    for key in unread:
+        del dataset.meta.features[key]
+        (dataset.reader.delta_indices or {}).pop(key, None)
+    dataset.reader.hf_dataset = hf_dataset.remove_columns([key for key in unread if key in hf_dataset.column_names])
+    if not wanted or not settings.cache_frames:
+        return
+    if whole in _frames and whole is not None:
+        index, of_whole = (one.hf_dataset.data.column("index").to_numpy() for one in (dataset, whole))
+        rows = np.searchsorted(of_whole, index)
+        _frames[dataset] = {key: Rows(frames, rows) for key, frames in _frames[whole].items()}
+    else:
+        serve_frames(dataset, wanted, (settings.image_size[0], settings.image_size[1]))
 
 
 def serve_frames(dataset: LeRobotDataset, cameras: Sequence[str], size: tuple[int, int]) -> None:
@@ -177,7 +226,10 @@ def serve_frames(dataset: LeRobotDataset, cameras: Sequence[str], size: tuple[in
 
 
 def gather(
-    columns: Columns, reader: DatasetReader, indices: Iterable[int], frames: Mapping[str, np.ndarray] | None = None
+    columns: Columns,
+    reader: DatasetReader,
+    indices: Iterable[int],
+    frames: Mapping[str, np.ndarray | Rows] | None = None,
 ) -> Windows:
     """The items `indices`, any order, negative ones from the end, as `DatasetReader.get_item` would read each.
 

@@ -1,7 +1,7 @@
 """A LeRobot batch -> a `Window`: the factors of K steps as tensors, in the dataset's units; and those units'
 statistics.
 
-Legend of shapes: B windows, K steps, D the numbers of a factor.
+Legend of shapes: B windows, K steps, D the numbers of a factor; C channels, H and W pixels of a picture.
 """
 
 import logging
@@ -17,6 +17,7 @@ from lerobot_unimask.data.factors import (
     ACTION,
     LOG_SCALE,
     STATE,
+    Camera,
     Component,
     Factor,
     Feature,
@@ -33,7 +34,8 @@ class Window:
     """K steps of B trajectories.
 
     values: factor -> (B, K, D) float32, in the dataset's units; discrete values are category numbers. `rtg` holds
-        (return-to-go, timestep / horizon).
+        (return-to-go, timestep / horizon). A camera's are pictures, (B, K, C, H, W), uint8 or float32 from 0 to 1, or
+        the tokens that the network has made of them, (B, K, width).
     valid: (B, K) bool, False past the episode's end.
     """
 
@@ -57,19 +59,22 @@ def make_window(
     horizon: Tensor,
     fps: Tensor,
     partial: bool = False,
+    cameras: Mapping[str, Camera] | None = None,
 ) -> Window:
-    """Read a window from a LeRobot batch, which is not changed.
+    """Read a window from a LeRobot batch, which is not changed. Pictures are not copied.
 
     Args:
         batch: the dataset's keys, each (B, K, size) or, for features of one number, (B, K) or (B, K, 1);
             `observation.state_is_pad` (B, K) if steps lie past the episode's end; `timestamp` (B,), seconds of step 0.
         horizon: steps of an episode. With `fps` it turns the timestamp into the return token's timestep / horizon.
         partial: columns may be missing, all but one; their values are NaN then.
+        cameras: by name, the columns of pictures to read.
 
     Raises:
         KeyError: a column that the model needs is missing.
-        ValueError: a column's shape is not (B, context_length, size).
+        ValueError: a column's shape is not (B, context_length, size), or a camera's not (B, context_length, C, H, W).
     """
+    cameras = cameras or {}
     values = {}
     present = [feature.key for columns in features.values() for feature in columns if feature.key in batch]
     for name, columns in features.items():
@@ -84,6 +89,11 @@ def make_window(
             parts.append(_timestep(batch, parts[0], fps) / horizon)
         values[name] = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
     first = next(iter(values.values()))
+    for name, camera in cameras.items():
+        if partial and camera.key not in batch:
+            values[name] = first.new_full((1, 1, 1, 1, 1), torch.nan).expand(*first.shape[:2], *camera.shape)
+        else:
+            values[name] = _pictures(batch, camera, context_length)
     lengths = {name: len(value) for name, value in values.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"The batch's columns are of different length: {lengths}.")
@@ -99,7 +109,10 @@ def make_window(
 
 
 def read_batch(
-    batch: Mapping[str, Any], features: Mapping[str, Sequence[Feature]], device: torch.device
+    batch: Mapping[str, Any],
+    features: Mapping[str, Sequence[Feature]],
+    device: torch.device,
+    cameras: Mapping[str, Camera] | None = None,
 ) -> dict[str, Tensor]:
     """A batch's columns as tensors on a device. What is none stays out, where the model does not read it.
 
@@ -109,6 +122,7 @@ def read_batch(
     if not isinstance(batch, Mapping):
         raise ValueError(f"A batch maps the dataset's columns to tensors; this is a {type(batch).__name__}.")
     read = {feature.key for columns in features.values() for feature in columns}
+    read |= {camera.key for camera in (cameras or {}).values()}
     read |= {f"{key}_is_pad" for key in read} | {"timestamp", "index"}
     return {
         key: as_tensor(repr(key), value, device)
@@ -169,6 +183,21 @@ def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:
             f"{K} steps from the sampled frame on."
         )
     return value.to(torch.float32, copy=True)  # changing a window must not change the batch it was read from
+
+
+def _pictures(batch: Mapping[str, Tensor], camera: Camera, K: int) -> Tensor:
+    """(B, K, C, H, W) of any height and width, as they are."""
+    if camera.key not in batch:
+        raise KeyError(f"The batch lacks {camera.key!r}, a camera of this model; it has {', '.join(sorted(batch))}.")
+    value = batch[camera.key]
+    if K == 1 and value.ndim == 4:  # LeRobot drops the only step
+        value = value.unsqueeze(1)
+    if value.ndim != 5 or value.shape[1:3] != (K, camera.shape[0]):
+        raise ValueError(
+            f"The batch's {camera.key!r} has shape {tuple(value.shape)}; a window's pictures are (batch, {K}, "
+            f"{camera.shape[0]}, height, width)."
+        )
+    return value
 
 
 def _timestep(batch: Mapping[str, Tensor], like: Tensor, fps: Tensor) -> Tensor:
@@ -261,8 +290,9 @@ class Statistics(nn.Module):
         values = {
             name: (value - self.get_buffer(f"{name}_mean")) / self.get_buffer(f"{name}_std")
             for name, value in window.values.items()
+            if name in self.features
         }
-        return Window(values, window.valid)
+        return Window(window.values | values, window.valid)  # pictures as they are
 
     def denormalise(self, name: str, component: Component, output: Tensor) -> tuple[Tensor, Tensor | None]:
         """A network's output for one continuous component, (..., size), as mean and scale in the dataset's units, each

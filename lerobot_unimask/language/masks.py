@@ -45,7 +45,9 @@ RANDOM_MASK = "random_mask"  # not a question: each window draws how much of it 
 
 REGIMES: dict[str, tuple[str, ...]] = {"multi_task": tuple(TASKS)}
 
-ASKABLE = ("s", "a")  # every other factor is a property: shown at step 0 or not at all, never asked
+# Every other factor is a camera, shown at any step and never asked, or a property, shown at step 0 and never asked.
+ASKABLE = ("s", "a")
+STATE = "state"  # in a text, the numbers of `s` without the cameras; in tables and masks these are the factor "s"
 
 
 class Token(NamedTuple):
@@ -59,8 +61,9 @@ class Token(NamedTuple):
         return f"{self.factor}@{self.step}" if self.of_episode else f"{self.factor}[{self.step}]"
 
 
-def parse_token(text: str, factors: Sequence[str], context_length: int) -> Token:
-    """A single token: `s[-1]`, the window's last state, or `s@150`, that at step 150 of the episode.
+def parse_token(text: str, factors: Sequence[str], context_length: int, cameras: Sequence[str] = ()) -> Token:
+    """A single token: `s[-1]`, the window's last state, `top[-1]`, its last picture, or `s@150`, the state at step 150
+    of the episode. `s` and `state` both name the numbers here.
 
     Raises:
         MaskError: it is not one token of this model.
@@ -69,13 +72,14 @@ def parse_token(text: str, factors: Sequence[str], context_length: int) -> Token
     steps = [step for term in terms for step in term.steps]
     if len(steps) != 1 or not isinstance(steps[0], Index) or steps[0].relative:
         raise MaskError("A value is given to a single token, such as s[-1], rtg[0] or s@150.", text, 0)
-    _check_factors(terms, factors, text)
+    _check_factors(terms, (*factors, *cameras), text)
+    name = _own_factor(terms[0].factor, factors)
     if terms[0].of_episode:
-        if terms[0].factor not in ASKABLE:
-            raise MaskError(f"{terms[0].factor} can be given at step 0 only: write {terms[0].factor}[0].", text, 0)
-        return Token(terms[0].factor, steps[0].value, of_episode=True)
-    chosen = _select(terms, factors, context_length, -1, text)
-    return Token(terms[0].factor, int(chosen.any(0).int().argmax()))
+        if name not in (*ASKABLE, *cameras):
+            raise MaskError(f"{name} can be given at step 0 only: write {name}[0].", text, 0)
+        return Token(name, steps[0].value, of_episode=True)
+    chosen = _select(terms, factors, cameras, context_length, -1, text)
+    return Token(name, int(chosen.any(0).int().argmax()))
 
 
 def parse(text: str, factors: Sequence[str] = ()) -> Question:
@@ -114,6 +118,7 @@ class MaskTable:
     shown: Tensor
     asked: Tensor
     t: Tensor
+    cameras: tuple[str, ...] = ()  # which of the factors are pictures
 
     @functools.cached_property
     def shows(self) -> dict[str, Tensor]:
@@ -124,9 +129,9 @@ class MaskTable:
     def shows_ahead(self) -> dict[str, Tensor]:
         """factor -> (K,) bool: tokens shown by some row before a rollout at its t can have observed them."""
         steps, t = torch.arange(self.shown.shape[-1]), self.t[:, None]
-        ahead = {"s": steps > t, "a": steps >= t}  # (R, K); a property is never observed
-        always = torch.ones_like(steps > t)
-        return {name: (self.shown[:, f] & ahead.get(name, always)).any(0) for f, name in enumerate(self.factors)}
+        always = torch.ones_like(steps > t)  # (R, K); a property is never observed
+        ahead = dict.fromkeys(self.factors, always) | dict.fromkeys(("s", *self.cameras), steps > t) | {"a": steps >= t}
+        return {name: (self.shown[:, f] & ahead[name]).any(0) for f, name in enumerate(self.factors)}
 
     @functools.cached_property
     def acts(self) -> bool:
@@ -168,29 +173,33 @@ class MaskTable:
 
 
 @functools.lru_cache(maxsize=256)
-def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTable:
+def tabulate(text: str, factors: tuple[str, ...], context_length: int, cameras: tuple[str, ...] = ()) -> MaskTable:
     """Work out, for every t that `text` admits, which tokens of a window are shown and which are asked for.
 
     Args:
         text: a question or the name of a task.
         factors: the model's factors, `s` and `a` first; the others are properties.
         context_length: K.
+        cameras: names of its cameras, which the table has after the factors.
 
     Raises:
-        MaskError: unknown factor, a step outside the window, a property asked for or shown after step 0, nothing asked.
+        MaskError: unknown factor, a step outside the window, a camera or property asked for, a property shown after
+            step 0, nothing asked.
     """
     question = parse(text, factors)
     text = question.text
-    _check_factors(question.terms, factors, text)
+    _check_factors(question.terms, (*factors, *cameras), text)
     for term in question.asked:
-        if term.factor not in ASKABLE:
-            raise MaskError(f"{term.factor} can be shown but never asked; ask for s or a.", text, term.position)
+        if _own_factor(term.factor, factors) not in ASKABLE:
+            kind = " is a camera, which" if term.factor in cameras else ""
+            raise MaskError(f"{term.factor}{kind} can be shown but never asked; ask for s or a.", text, term.position)
     rows: list[tuple[int, Tensor, Tensor]] = []
     for t in range(context_length) if question.uses_t else (-1,):
-        asked = _select(question.asked, factors, context_length, t, text)
-        shown = _select(question.shown, factors, context_length, t, text)
+        asked = _select(question.asked, factors, cameras, context_length, t, text)
+        shown = _select(question.shown, factors, cameras, context_length, t, text)
         if asked is None or shown is None:
             continue  # an integer index falls outside the window at this t
+        asked[len(factors) :] = False  # of all that is observed, `s` asks for the numbers
         asked &= ~shown  # what is shown is not asked
         if asked.any():
             rows.append((t, shown, asked))
@@ -199,16 +208,17 @@ def tabulate(text: str, factors: tuple[str, ...], context_length: int) -> MaskTa
         raise MaskError(f"Nothing is asked that is not shown{where}.", text, question.asked[0].position)
     return MaskTable(
         question,
-        tuple(factors),
+        (*factors, *cameras),
         shown=torch.stack([shown for _, shown, _ in rows]),
         asked=torch.stack([asked for _, _, asked in rows]),
         t=torch.tensor([t for t, _, _ in rows]),
+        cameras=tuple(cameras),
     )
 
 
 def _check_factors(terms: Sequence[Term], factors: Sequence[str], text: str) -> None:
     for term in terms:
-        if term.factor not in factors:
+        if _own_factor(term.factor, factors) not in factors:
             near = difflib.get_close_matches(term.factor, factors, n=1)
             hint = f" Did you mean {near[0]!r}?" if near else ""
             known = ", ".join(factors)
@@ -217,10 +227,21 @@ def _check_factors(terms: Sequence[Term], factors: Sequence[str], text: str) -> 
             )
 
 
-def _select(terms: Sequence[Term], factors: Sequence[str], K: int, t: int, text: str) -> Tensor | None:
-    """The tokens that `terms` name at this t, (F, K) bool; None where an integer rules this t out."""
-    chosen = torch.zeros(len(factors), K, dtype=torch.bool)
+def _own_factor(name: str, factors: Sequence[str]) -> str:
+    """The factor whose tokens a name's own are: that of the state's numbers is called `s`."""
+    return "s" if name == STATE and STATE not in factors else name
+
+
+def _select(
+    terms: Sequence[Term], factors: Sequence[str], cameras: Sequence[str], K: int, t: int, text: str
+) -> Tensor | None:
+    """The tokens that `terms` name at this t, (F, K) bool, `s` those of every camera too; None where an integer rules
+    this t out."""
+    names = (*factors, *cameras)
+    chosen = torch.zeros(len(names), K, dtype=torch.bool)
     for term in terms:
+        own = _own_factor(term.factor, factors)
+        rows = [names.index(name) for name in (own, *(cameras if term.factor == "s" else ()))]
         for part in term.steps:
             if isinstance(part, Slice):
                 bounds = slice(_bound(part.start, K, t), _bound(part.stop, K, t), part.step)
@@ -236,11 +257,12 @@ def _select(terms: Sequence[Term], factors: Sequence[str], K: int, t: int, text:
                         part.position,
                     )
                 steps = (step % K,)
-            if term.factor not in ASKABLE and any(steps):
+            if own not in (*ASKABLE, *cameras) and any(steps):
                 raise MaskError(
                     f"{term.factor} can be shown at step 0 only: write {term.factor}[0].", text, term.position
                 )
-            chosen[factors.index(term.factor), list(steps)] = True
+            for row in rows:
+                chosen[row, list(steps)] = True
     return chosen
 
 
@@ -260,8 +282,11 @@ class Mask:
 
         s ###..#  a ##?...
 
+    Here the factor `s` is the state's numbers; each camera has tokens of its own.
+
     `causal`, one bool or (B,), says which windows are read causally: each asked token sees only what is shown before it
-    in the order properties, s0, a0, s1, a1, ...; so one window may show a token to those after it and ask for it too.
+    in the order properties, s0, a0, s1, a1, ..., a step's cameras between its state and its action; so one window may
+    show a token to those after it and ask for it too.
     """
 
     shown: dict[str, Tensor]
@@ -288,16 +313,18 @@ class Mask:
             self.causal if isinstance(self.causal, bool) else self.causal.to(device),
         )
 
-    def next_tokens(self) -> dict[str, Tensor]:
-        """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and
-        action before it and none after; properties may be shown or not."""
+    def next_tokens(self, cameras: Sequence[str] = ()) -> dict[str, Tensor]:
+        """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state,
+        picture and action before it and none after; properties may be shown or not."""
+        names = ("s", *cameras, "a")
         shown, asked = (
-            torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1) for tokens in (self.shown, self.asked)
-        )  # (B, 2 K), in the order of time
+            torch.stack([tokens[name] for name in names], dim=-1).flatten(1) for tokens in (self.shown, self.asked)
+        )  # (B, n K), in the order of time
         order = torch.arange(shown.shape[1], device=shown.device)
         count = shown.sum(1, keepdim=True)
         history = shown.any(1, keepdim=True) & (shown == (order < count)).all(1, keepdim=True)
-        return dict(zip(ASKABLE, (history & asked & (order == count)).unflatten(1, (-1, 2)).unbind(-1), strict=True))
+        following = (history & asked & (order == count)).unflatten(1, (-1, len(names)))  # (B, K, n)
+        return {"s": following[..., 0], "a": following[..., -1]}
 
     def draw(self, window: int = 0) -> str:
         """One window's mask as text, in the notation of the class's docstring."""

@@ -20,9 +20,9 @@ class TrainingMasks(nn.Module):
     """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
 
     A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
-    apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
-    cloning does. The causal form of random masking shows all states and actions, each property with probability 1/2,
-    and asks for every token but the first state.
+    apart. That holds for questions that ask for one token and show all states, pictures and actions before it, as
+    behaviour cloning does. The causal form of random masking shows all of these, each property with probability 1/2,
+    and asks for every state and action but the first state.
 
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
@@ -31,6 +31,7 @@ class TrainingMasks(nn.Module):
         factors: the model's factors.
         context_length: K.
         causal_share: share of the windows that are causal.
+        cameras: names of its cameras, whose tokens come after the factors'.
 
     Raises:
         MaskError: a text that does not fit the model, or with a causal share of 1 has no causal form.
@@ -41,6 +42,7 @@ class TrainingMasks(nn.Module):
     asked: Tensor
     task_of_row: Tensor
     askable: Tensor
+    lasting: Tensor
     cumulative_weights: Tensor
     causal_shown: Tensor
     causal_asked: Tensor
@@ -54,11 +56,17 @@ class TrainingMasks(nn.Module):
         context_length: int,
         *,
         causal_share: float = 0.0,
+        cameras: Sequence[str] = (),
     ):
         super().__init__()
-        self.factors = tuple(factors)
-        self.weights = mixture(masks, self.factors)
-        tables = {text: tabulate(text, self.factors, context_length) for text in self.weights if text != RANDOM_MASK}
+        self.cameras = tuple(cameras)
+        self.factors = (*factors, *cameras)
+        self.weights = mixture(masks, factors)
+        tables = {
+            text: tabulate(text, tuple(factors), context_length, self.cameras)
+            for text in self.weights
+            if text != RANDOM_MASK
+        }
         tasks = {text: task for task, text in enumerate(self.weights)}
         self.random_task = tasks.get(RANDOM_MASK)
         empty = torch.zeros(0, len(self.factors), context_length, dtype=torch.bool)
@@ -68,6 +76,7 @@ class TrainingMasks(nn.Module):
         self._keep("asked", torch.cat([empty, *(table.asked for table in tables.values())]))
         self._keep("task_of_row", torch.tensor([tasks[text] for text in tables for _ in tables[text].t]).long())
         self._keep("askable", torch.tensor([name in ASKABLE for name in self.factors])[:, None])  # (F, 1)
+        self._keep("lasting", self.askable | torch.tensor([name in self.cameras for name in self.factors])[:, None])
         self._keep("cumulative_weights", _cumulative(weights))
         forms = [self._causal_form(tables.get(text), context_length) for text in self.weights]
         capable = torch.tensor([form is not None for form in forms])
@@ -96,10 +105,10 @@ class TrainingMasks(nn.Module):
             shown = torch.ones(len(self.factors), K, dtype=torch.bool)
             asked = self.askable.repeat(1, K)
             asked[self.factors.index("s"), 0] = False  # nothing of the window comes before it
-            shown[[f for f, name in enumerate(self.factors) if name not in ASKABLE], 1:] = False
+            shown[~self.lasting[:, 0], 1:] = False
             return shown, asked
         mask = table.masks()
-        following = mask.next_tokens()
+        following = mask.next_tokens(self.cameras)
         if any((following[name] != mask.asked[name]).any() for name in ASKABLE):
             return None
         return table.shown.any(0), table.asked.any(0)
@@ -107,7 +116,7 @@ class TrainingMasks(nn.Module):
     def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
         """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
         causally. All else it answers in both directions."""
-        following = mask.next_tokens()
+        following = mask.next_tokens(self.cameras)
         if self.causal_share > 0 and self.random_task is not None:
             return following
         learnt = self.causal_row & (self.causal_share > 0)  # (R,)
@@ -146,7 +155,7 @@ class TrainingMasks(nn.Module):
             task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
             history = self.causal_shown[task]
             if self.random_task is not None:
-                history = history & (self.askable | ~hidden | (task != self.random_task)[:, None, None])
+                history = history & (self.lasting | ~hidden | (task != self.random_task)[:, None, None])
             shown = torch.where(causal[:, None, None], history, shown)
             asked = torch.where(causal[:, None, None], self.causal_asked[task], asked)
         return Mask(self._by_factor(shown), self._by_factor(asked), causal).within(valid)
@@ -165,17 +174,20 @@ class TrainingMasks(nn.Module):
         return self.shown[row] & some, self.asked[row] & some
 
     def _hidden(self, probability: Tensor, uniform: Tensor) -> Tensor:
-        """Random masking (paper, section 2.2 and appendix C): p ~ U(0, 1) per window, each state and action hidden
-        with probability p; a property's first token hidden with probability 1/2, its later ones always. (B, F, K)."""
+        """Random masking (paper, section 2.2 and appendix C): p ~ U(0, 1) per window, each state, picture and action
+        hidden with probability p; a property's first token hidden with probability 1/2, its later ones always.
+        (B, F, K)."""
         hidden = uniform < probability[:, None, None]
         for f, name in enumerate(self.factors):
-            if name not in ASKABLE:
+            if name not in (*ASKABLE, *self.cameras):
                 hidden[:, f, 0] = uniform[:, f, 0] < 0.5
                 hidden[:, f, 1:] = True
         return hidden
 
 
-def validation_masks(text: str, factors: tuple[str, ...], valid: Tensor, index: Tensor) -> Mask:
+def validation_masks(
+    text: str, factors: tuple[str, ...], valid: Tensor, index: Tensor, cameras: Sequence[str] = ()
+) -> Mask:
     """One question for each window, the same for every policy.
 
     Args:
@@ -186,7 +198,7 @@ def validation_masks(text: str, factors: tuple[str, ...], valid: Tensor, index: 
     Raises:
         MaskError: a factor of the question is not among `factors`.
     """
-    draw = TrainingMasks(text, factors, valid.shape[1]).to(valid.device)
+    draw = TrainingMasks(text, factors, valid.shape[1], cameras=cameras).to(valid.device)
     return draw(valid, index.to(valid.device), seed=0, step=VALIDATION_STEP)
 
 

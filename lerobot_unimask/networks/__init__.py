@@ -11,8 +11,11 @@ from lerobot_unimask.networks.feedforward import FeedForward
 from lerobot_unimask.networks.transformer import Transformer
 
 
-def make_network(config: UniMASKConfig, factors: dict[str, Factor]) -> nn.Module:
-    """The network that the config names, for these factors.
+def make_network(config: UniMASKConfig, factors: dict[str, Factor], *, load_backbone: bool = True) -> nn.Module:
+    """The network that the config names, for these factors and the config's cameras.
+
+    Args:
+        load_backbone: whether pretrained weights of what looks at pictures are fetched; a checkpoint brings its own.
 
     Raises:
         ValueError: the network needs a factor that is not there.
@@ -32,6 +35,12 @@ def make_network(config: UniMASKConfig, factors: dict[str, Factor]) -> nn.Module
                 stacked=config.token_layout == "stacked",
                 residuals=config.state_residuals,
                 heads=config.heads,
+                cameras=config.pictures,
+                backbone={
+                    "backbone": config.vision_backbone,
+                    "weights": config.pretrained_backbone_weights,
+                    "load": load_backbone,
+                },
                 **shared,
             )
         case "feedforward":

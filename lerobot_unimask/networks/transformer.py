@@ -7,11 +7,14 @@ it and those before it, so that one pass answers for every step of a window.
 Legend of shapes: B windows, K steps, F factors, N tokens, D the dimensions of a factor, W width, H heads.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.factors import Camera, Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
 from lerobot_unimask.networks.layers import (
@@ -24,6 +27,7 @@ from lerobot_unimask.networks.layers import (
     _before_or_here,
     course,
 )
+from lerobot_unimask.networks.vision import CameraEmbedding
 
 
 class Transformer(nn.Module):
@@ -31,9 +35,11 @@ class Transformer(nn.Module):
 
     Args:
         factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
+        cameras: those whose pictures a step has.
+        backbone: arguments of each camera's `CameraEncoder`.
         stacked: one token per step, made of all its factors (paper, appendix "Input stacking"), which cannot attend
-            causally; otherwise one token for each property, at the front, and one for each state and action, in the
-            order of time.
+            causally; otherwise one token for each property, at the front, and one for each state, picture and action,
+            in the order of time.
         residuals: whether to predict continuous states as departures from their `course`.
         fine_inputs: whether to read continuous values as `NumberEncoding` does.
     """
@@ -51,16 +57,20 @@ class Transformer(nn.Module):
         heads: int,
         feedforward_width: int,
         dropout: float,
+        cameras: Mapping[str, Camera] | None = None,
+        backbone: Mapping[str, Any] | None = None,
     ):
         super().__init__()
+        cameras = cameras or {}
         self.stacked = stacked
+        self.order = ("s", *cameras, "a")  # of a step's tokens
         self.properties = [name for name in factors if name not in ASKABLE]
         self.embeddings = nn.ModuleDict(
             {name: FactorEmbedding(factor, width, fine_inputs=fine_inputs) for name, factor in factors.items()}
         )
         if stacked:
-            self.stack = nn.Linear(len(factors) * width, width)
-        tokens = context_length if stacked else len(self.properties) + len(ASKABLE) * context_length
+            self.stack = nn.Linear((len(factors) + len(cameras)) * width, width)
+        tokens = context_length if stacked else len(self.properties) + len(self.order) * context_length
         self.positions = nn.Parameter(0.02 * torch.randn(tokens, width))  # within the window, not the episode
         self.dropout = Dropout(dropout)
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
@@ -69,6 +79,9 @@ class Transformer(nn.Module):
             i: c.dims for i, c in enumerate(factors["s"].components) if residuals and not c.discrete
         }  # which of the states' components, and their dimensions
         self.heads = Heads(factors, width)
+        self.cameras = nn.ModuleDict(
+            {name: CameraEmbedding(camera.shape, width, **(backbone or {})) for name, camera in cameras.items()}
+        )
 
     def forward(
         self,
@@ -91,7 +104,8 @@ class Transformer(nn.Module):
             asked: factor -> (B, K) bool, True = asked: what is read of the predictions. On a processor the last block
                 and the heads compute nothing else. None: all.
         """
-        tokens = {name: embed(window.values[name], shown[name]) for name, embed in self.embeddings.items()}
+        embeddings = (*self.embeddings.items(), *self.cameras.items())
+        tokens = {name: embed(window.values[name], shown[name]) for name, embed in embeddings}
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
         x = self.dropout(x + self.positions)
         if asked is not None and cache is None and not self.stacked and x.device.type == "cpu":
@@ -118,8 +132,8 @@ class Transformer(nn.Module):
         earlier = (
             int(causal) if isinstance(causal, bool) else causal.long()[:, None]
         )  # 1: predicted from the one before
-        step = len(self.properties) + len(ASKABLE) * torch.arange(asked["s"].shape[1]) - earlier
-        position = [(step + i).expand(B, -1)[asked[name]] for i, name in enumerate(ASKABLE)]
+        step = len(self.properties) + len(self.order) * torch.arange(asked["s"].shape[1]) - earlier
+        position = [(step + self.order.index(name)).expand(B, -1)[asked[name]] for name in ASKABLE]
         window = [asked[name].nonzero()[:, 0] for name in ASKABLE]
         sizes = [len(rows) for rows in position]
         place = torch.cat(position)  # (M,) of what each asked token is predicted from, in its window; -1: nothing
@@ -154,19 +168,20 @@ class Transformer(nn.Module):
         return functional.pad(new.unsqueeze(1), (0, 0, count - 1, x.shape[1] - count))
 
     def _count(self, shown: dict[str, Tensor]) -> int:
-        """Tokens up to the last state or action that is shown in some window."""
-        steps = torch.stack([shown[name].any(0) for name in ASKABLE], dim=1).flatten()  # (2 K,)
+        """Tokens up to the last state, picture or action that is shown in some window."""
+        steps = torch.stack([shown[name].any(0) for name in self.order], dim=1).flatten()  # (n K,)
         numbers = steps.nonzero()
         return len(self.properties) + (int(numbers[-1]) + 1 if len(numbers) else 0)
 
     def _stack(self, tokens: dict[str, Tensor]) -> Tensor:
-        return self.stack(torch.cat(list(tokens.values()), dim=-1))  # (B, K, F W) -> (B, K, W)
+        return self.stack(torch.cat(list(tokens.values()), dim=-1))  # (B, K, (F + cameras) W) -> (B, K, W)
 
     def _lay_out(self, tokens: dict[str, Tensor]) -> Tensor:
-        """Properties (their first step alone is ever shown), then s0 a0 s1 a1 ...: (B, P + 2 K, W)."""
-        steps = torch.stack([tokens[name] for name in ASKABLE], dim=2).flatten(1, 2)  # (B, 2 K, W)
+        """Properties (their first step alone is ever shown), then s0 a0 s1 a1 ..., a step's n - 2 pictures between its
+        state and its action: (B, P + n K, W)."""
+        steps = torch.stack([tokens[name] for name in self.order], dim=2).flatten(1, 2)  # (B, n K, W)
         return torch.cat([*(tokens[name][:, :1] for name in self.properties), steps], dim=1)
 
     def _split(self, x: Tensor) -> dict[str, Tensor]:
-        steps = x[:, len(self.properties) :].unflatten(1, (-1, len(ASKABLE)))  # (B, K, 2, W)
-        return {name: steps[:, :, i] for i, name in enumerate(ASKABLE)}
+        steps = x[:, len(self.properties) :].unflatten(1, (-1, len(self.order)))  # (B, K, n, W)
+        return {name: steps[:, :, self.order.index(name)] for name in ASKABLE}

@@ -3,10 +3,19 @@
 Shapes: B windows, K steps, C channels, H and W pixels, D width of a token, N pictures that are shown.
 """
 
+import functools
+import logging
+from collections.abc import Iterable, Sequence
+from typing import Any
+
 import torch
 import torchvision
 from lerobot.policies.diffusion.modeling_diffusion import SpatialSoftmax
 from torch import Tensor, nn
+
+from lerobot_unimask.data.frames import resized
+
+logger = logging.getLogger(__name__)
 
 KEYPOINTS = 32  # as in LeRobot's diffusion policy: 64 numbers for each picture
 
@@ -33,24 +42,30 @@ class CameraEncoder(nn.Module):
     """A convolutional network, a spatial softmax (Finn et al., 2016, as LeRobot's diffusion policy has it), a layer.
 
     Args:
-        shape: channels, height and width of the pictures.
+        shape: channels, height and width of the pictures; others are resized.
         width: size of a token, D.
         backbone: name of a ResNet of torchvision, or None: three convolutions.
         weights: name of that ResNet's weights in torchvision; None: drawn. With weights its batch norms stay, and are
             used as in evaluation, so that no picture depends on others of its batch.
+        load: whether these weights are fetched; a checkpoint brings its own.
 
     Raises:
         ValueError: pictures so small that the spatial softmax has one place to look at.
     """
 
     def __init__(
-        self, shape: tuple[int, int, int], width: int, backbone: str | None = None, weights: str | None = None
+        self,
+        shape: Sequence[int],
+        width: int,
+        backbone: str | None = None,
+        weights: str | None = None,
+        load: bool = True,
     ):
         super().__init__()
         if backbone is None:
             self.backbone = _convolutions(shape[0])
         else:
-            resnet = getattr(torchvision.models, backbone)(weights=weights)
+            resnet = getattr(torchvision.models, backbone)(weights=weights if load else None)
             self.backbone = nn.Sequential(*list(resnet.children())[:-2])  # without its pooling and its classifier
             if weights is None:
                 _group_norms(self.backbone)
@@ -65,6 +80,7 @@ class CameraEncoder(nn.Module):
         self.pool = SpatialSoftmax(maps, num_kp=KEYPOINTS)
         self.out = nn.Linear(2 * KEYPOINTS, width)
         self.width = width
+        self.size = (shape[1], shape[2])
         self.train()
 
     def train(self, mode: bool = True) -> "CameraEncoder":
@@ -78,7 +94,7 @@ class CameraEncoder(nn.Module):
     def forward(self, pictures: Tensor, shown: Tensor) -> Tensor:
         """
         Args:
-            pictures: (B, K, C, H, W), uint8 or numbers from 0 to 1.
+            pictures: (B, K, C, H, W), uint8 or numbers from 0 to 1, of any height and width.
             shown: (B, K) booleans; pictures that are not shown are not looked at.
 
         Returns:
@@ -88,6 +104,41 @@ class CameraEncoder(nn.Module):
         if not shown.any():
             return tokens
         seen = pictures[shown]  # (N, C, H, W)
+        if seen.shape[-2:] != self.size:
+            _say_once(tuple(seen.shape[-2:]), self.size)
+            seen = resized(seen, self.size)
         seen = seen.to(tokens.dtype) / 255 if seen.dtype == torch.uint8 else seen.to(tokens.dtype)
         keypoints = self.pool(self.backbone(2 * seen - 1)).flatten(1)  # (N, 2 * KEYPOINTS)
-        return tokens.masked_scatter(shown[..., None], self.out(keypoints))
+        return tokens.masked_scatter(shown[..., None], self.out(keypoints).to(tokens.dtype))
+
+
+class CameraEmbedding(nn.Module):
+    """One camera's tokens. Hidden is learned, as in `FactorEmbedding`. For arguments see `CameraEncoder`."""
+
+    def __init__(self, shape: Sequence[int], width: int, **backbone: Any):
+        super().__init__()
+        self.encoder = CameraEncoder(shape, width, **backbone)
+        self.hidden = nn.Parameter(0.02 * torch.randn(width))
+
+    def forward(self, value: Tensor, shown: Tensor) -> Tensor:
+        """Pictures (B, K, C, H, W), or what `encoder` has made of them before, (B, K, D), and (B, K) -> (B, K, D)."""
+        tokens = value if value.ndim == 3 else self.encoder(value, shown)
+        return torch.where(shown.unsqueeze(-1), tokens, self.hidden)
+
+
+def parameter_groups(model: nn.Module, rate: float | None) -> Iterable[nn.Parameter] | list[dict[str, Any]]:
+    """What an optimiser is given: the parameters, those of what looks at pictures apart where they learn at a `rate` of
+    their own."""
+    backbones = [module.backbone for module in model.modules() if isinstance(module, CameraEncoder)]
+    seeing = [parameter for backbone in backbones for parameter in backbone.parameters()]
+    if rate is None or not seeing:
+        return model.parameters()
+    apart = set(map(id, seeing))
+    rest: list[nn.Parameter] = [parameter for parameter in model.parameters() if id(parameter) not in apart]
+    groups: list[dict[str, Any]] = [{"params": rest}, {"params": seeing, "lr": rate}]
+    return groups
+
+
+@functools.cache
+def _say_once(size: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+    logger.warning("Pictures of %s x %s are resized to %s x %s, at which this model reads them.", *size, *wanted)

@@ -1,0 +1,137 @@
+"""A robot arm's recording, two cameras of 640 x 480 at 30 Hz, made by LeRobot's own writer from noise and ramps: it is
+trained on through lerobot-train, resumed, questioned and acted from; other policies read it as without the plugin."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask.data import frames, reads
+from lerobot_unimask.data.episodes import open_dataset, read_windows
+
+K, LENGTHS = 3, (5, 4)
+CAMERAS = ("observation.images.laptop", "observation.images.phone")
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+POLICY = (
+    "--policy.type=unimask",
+    "--policy.push_to_hub=false",
+    f"--policy.context_length={K}",
+    "--policy.width=16",
+    "--policy.depth=1",
+    "--policy.heads=2",
+    "--policy.feedforward_width=16",
+    "--policy.device=cpu",
+    "--policy.image_size=[48, 64]",
+)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    root = tmp_path_factory.mktemp("recording") / "dataset"
+    camera = {"dtype": "video", "shape": (480, 640, 3), "names": ["height", "width", "channels"]}
+    joints = {"dtype": "float32", "shape": (6,), "names": JOINTS}
+    features = {"observation.state": joints, "action": joints, **dict.fromkeys(CAMERAS, camera)}
+    dataset = LeRobotDataset.create("local/arm", 30, features, root=root, use_videos=True, robot_type="so100_follower")
+    rng = np.random.default_rng(0)
+    ramp = np.add.outer(np.arange(480), np.arange(640))[..., None] * np.array([1, 2, 3])
+    for length in LENGTHS:
+        for step in range(length):
+            pictures = {
+                key: ((ramp + 9 * step + rng.integers(8, size=ramp.shape)) % 256).astype(np.uint8) for key in CAMERAS
+            }
+            numbers = {key: rng.normal(size=6).astype(np.float32) for key in ("observation.state", "action")}
+            dataset.add_frame({**pictures, **numbers, "task": "pick up the cube"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.fixture
+def train(recording, tmp_path, monkeypatch):
+    """train(*flags): lerobot-train on the recording in this process, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(frames, "frames_folder", lambda: tmp_path / "frames")
+
+    def run(*flags):
+        from lerobot.scripts import lerobot_train
+
+        data = ("--dataset.repo_id=local/arm", f"--dataset.root={recording}", "--batch_size=4", "--num_workers=0")
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags, *(data if "--resume=true" not in flags else ())])
+        lerobot_train.main()
+
+    return run
+
+
+def test_it_trains_resumes_is_questioned_and_acts(train, recording, tmp_path, monkeypatch):
+    train(*POLICY, "--steps=3", "--save_freq=3", "--output_dir=run", "--dataset.eval_split=0.5", "--eval_steps=2")
+    assert len(list((tmp_path / "frames").glob("*.frames"))) == 2  # the parts share the whole dataset's
+    train("--resume=true", "--config_path=run/checkpoints/last/pretrained_model/train_config.json", "--steps=5")
+    policy = UniMASKPolicy.from_pretrained("run")
+    assert int(policy.updates) == 5
+    assert {name: camera.shape for name, camera in policy.cameras.items()} == {
+        "laptop": [3, 48, 64],
+        "phone": [3, 48, 64],
+    }
+
+    dataset = open_dataset(policy.config, recording)
+    batch = read_windows(dataset, [0, 5])
+    assert batch[CAMERAS[0]].shape == (2, K, 3, 48, 64)
+    answer = policy.infer(batch, "a[t] | s[:t+1], a[:t]", t=1).most_likely("a")
+    shown = {key: batch[key][:, 0] for key in ("observation.state", *CAMERAS)}
+    assert policy.select_action(shown).shape == (2, 6)
+    whole = {**shown, **{key: frames.resized(torch.rand(2, 3, 480, 640), (480, 640)) for key in CAMERAS}}
+    assert policy.predict_action_chunk(whole).shape == (2, 1, 6)
+    changed = {**batch, CAMERAS[1]: 255 - batch[CAMERAS[1]]}
+    assert not torch.equal(policy.infer(changed, "a[t] | s[:t+1], a[:t]", t=1).most_likely("a")[:, 1], answer[:, 1])
+
+
+def test_cameras_that_are_not_read_are_not_decoded(train, monkeypatch, tmp_path):
+    decoded = []
+    original = frames._decode
+    monkeypatch.setattr(frames, "_decode", lambda *args: decoded.append(args[1]) or original(*args))
+    monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", lambda *args, **_: decoded.append(args))
+    train(*POLICY, "--policy.cameras=[]", "--steps=2", "--output_dir=blind")
+    assert decoded == []
+    assert UniMASKPolicy.from_pretrained(tmp_path / "blind").cameras == {}
+    train(*POLICY, '--policy.cameras=["observation.images.phone"]', "--steps=2", "--output_dir=one")
+    assert set(decoded) == {"observation.images.phone"}
+
+
+def test_uncached_it_learns_the_same(train, tmp_path):
+    losses = {}
+    original = UniMASKPolicy.forward
+    for cached in ("true", "false"):
+        recorded = losses[cached] = []
+
+        def forward(self, batch, recorded=recorded):
+            loss, parts = original(self, batch)
+            recorded.append(loss.item())
+            return loss, parts
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(UniMASKPolicy, "forward", forward)
+            train(*POLICY, f"--policy.cache_frames={cached}", "--steps=2", "--output_dir=cached_" + cached)
+    np.testing.assert_allclose(losses["true"], losses["false"], rtol=1e-3)
+
+
+def test_other_policies_read_what_they_read_without_the_plugin(recording, monkeypatch):
+    """act, K = 1 frame of each camera at 640 x 480, item by item: no frames are cached or left out for it."""
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.datasets import factory
+    from lerobot.policies.act.configuration_act import ACTConfig
+
+    config = TrainPipelineConfig(
+        DatasetConfig("local/arm", root=str(recording)), policy=ACTConfig(device="cpu", chunk_size=3, n_action_steps=3)
+    )
+    dataset = factory.make_dataset(config)
+    plain = factory.make_dataset.__wrapped__(config)
+    assert reads.batched_read(dataset) is None
+    assert dataset.meta.camera_keys == list(CAMERAS)
+    one, other = dataset[3], plain[3]
+    assert one.keys() == other.keys()
+    for key, value in other.items():
+        assert torch.equal(one[key], value) if isinstance(value, torch.Tensor) else one[key] == value, key
