@@ -7,7 +7,8 @@ import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE, REWARD
 from tqdm import tqdm
 
-from dataset_builders.writer import refuse_existing, write_dataset
+from dataset_builders.folders import refuse_existing
+from dataset_builders.writer import write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.doorkey.episodes import Episodes, rollout
 from lerobot_unimask.envs.doorkey.expert import Expert

@@ -14,7 +14,6 @@ import os
 import re
 import shutil
 import sys
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,12 @@ import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from tqdm import tqdm
 
+from dataset_builders.folders import refuse_existing, written_whole
 from dataset_builders.writer import (
     PROVENANCE_PATH,
     dataset_statistics,
     episode_statistics,
     provenance_of_now,
-    refuse_existing,
 )
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.sharing.hub import commit_of
@@ -135,30 +134,26 @@ def add_label(
             `root` is what the Hub's client keeps of a commit.
     """
     root = Path(root).expanduser().resolve()
-    info = _read_info(root)
+    _read_info(root)
     if not re.fullmatch(r"observation\.[\w.]+", name):
         raise ValueError(f"name is {name!r}; a label is named observation.NAME, or LeRobot reads no windows of it.")
-    if name in info["features"]:
-        raise ValueError(f"{root} has a column {name} already; choose another name.")
     if output is None and (commit := commit_of(root)):
         raise ValueError(f"{root} is commit {commit} of a Hub dataset, which stays as it is: give --output=DIR.")
     target = root if output is None else refuse_existing(output)
     if root in target.parents:
         raise ValueError(f"output is {target}, a folder inside the dataset itself; choose one beside it.")
-    column, lengths = _label_all(root, info, labeller, progress)
-    feature, column = _feature(column, categories)
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
-    try:
-        copy_rest(root, partial)
+    with written_whole(target, replacing=output is None) as new:
+        info = _read_info(root)  # now that nobody else adds a label
+        if name in info["features"]:
+            raise ValueError(f"{root} has a column {name} already; choose another name.")
+        column, lengths = _label_all(root, info, labeller, progress)
+        feature, column = _feature(column, categories)
+        copy_rest(root, new)
         info["features"][name] = feature
         statistics = episode_statistics(column, lengths)
-        _write_data(root, partial, info, name, column)
-        _write_episodes(root, partial, name, statistics)
-        _write_meta(partial, info, name, dataset_statistics(statistics), how)
-        put_in_place(partial, target, replacing=output is None)
-    except BaseException:  # Ctrl-C too
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+        _write_data(root, new, info, name, column)
+        _write_episodes(root, new, name, statistics)
+        _write_meta(new, info, name, dataset_statistics(statistics), how)
     return target
 
 
@@ -338,21 +333,3 @@ def _write_meta(
     record = json.loads(path.read_text()) if path.exists() else {}
     record.setdefault("labels", []).append({"name": name, "what": how, **provenance_of_now()})
     path.write_text(json.dumps(record, indent=4) + "\n")
-
-
-def put_in_place(partial: Path, target: Path, *, replacing: bool) -> None:
-    """The finished folder takes its name. In place of an old dataset, that one is set aside first and removed last."""
-    if not replacing:
-        if target.exists():
-            target.rmdir()  # fails, as it should, if somebody has put something there by now
-        partial.rename(target)
-        return
-    aside = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.old")
-    try:
-        target.rename(aside)
-        partial.rename(target)
-    except BaseException:
-        if not target.exists():
-            aside.rename(target)
-        raise
-    shutil.rmtree(aside, ignore_errors=True)

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from dataset_builders.writer import dataset_statistics, episode_statistics, refuse_existing, write_dataset
+from dataset_builders.folders import refuse_existing
+from dataset_builders.writer import dataset_statistics, episode_statistics, write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, _clip

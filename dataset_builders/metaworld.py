@@ -7,7 +7,8 @@ import numpy as np
 from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_STATE, REWARD
 from tqdm import tqdm
 
-from dataset_builders.writer import refuse_existing, write_dataset
+from dataset_builders.folders import refuse_existing
+from dataset_builders.writer import write_dataset
 from lerobot_unimask.envs.metaworld.environment import ENV_ID, FPS, HAND, MetaWorldEnv
 from lerobot_unimask.envs.metaworld.expert import Demonstration, demonstrate, make_expert
 from lerobot_unimask.envs.metaworld.record import HAND_NAMES

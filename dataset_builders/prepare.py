@@ -8,8 +8,6 @@ at all, and the old one stays as it is.
 Shapes: N frames, E episodes, D numbers of a column.
 """
 
-import shutil
-import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,8 +19,9 @@ import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from dataset_builders.label import copy_rest, data_files, episode_files, put_in_place, rewrite
-from dataset_builders.writer import dataset_statistics, episode_statistics, refuse_existing
+from dataset_builders.folders import refuse_existing, written_whole
+from dataset_builders.label import copy_rest, data_files, episode_files, rewrite
+from dataset_builders.writer import dataset_statistics, episode_statistics
 from lerobot_unimask.data.episodes import check_folder
 from lerobot_unimask.data.factors import flat_names
 from lerobot_unimask.records import read_json, write_json
@@ -162,20 +161,12 @@ def prepare(root: Path, plan: Plan, *, output: Path | None = None) -> Path:
     """
     root = Path(root).expanduser().resolve()
     target = root if output is None else refuse_existing(output)
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
-    converted = partial.with_name(f"{partial.name}.v30")
-    try:
-        source = convert(root, converted) if plan.convert else root
+    with written_whole(target, replacing=output is None) as new:
+        source = convert(root, new.with_name("converted")) if plan.convert else root
         if plan.convert:  # now the files can be looked for
             plan.drop += [k for k in make_plan(source).drop if k not in plan.drop]
-        copy_rest(source, partial, without=plan.drop)
-        _rewrite_all(source, partial, plan)
-        put_in_place(partial, target, replacing=output is None)
-    except BaseException:  # Ctrl-C too
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    finally:
-        shutil.rmtree(converted, ignore_errors=True)
+        copy_rest(source, new, without=plan.drop)
+        _rewrite_all(source, new, plan)
     return target
 
 

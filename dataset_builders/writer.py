@@ -12,9 +12,7 @@ import contextlib
 import importlib.metadata
 import json
 import shlex
-import shutil
 import sys
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +26,8 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import get_file_size_in_mb, write_info, write_stats
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, update_chunk_file_indices
 from tqdm import tqdm
+
+from dataset_builders.folders import refuse_existing, written_whole
 
 PROVENANCE_PATH = "meta/provenance.json"
 # LeRobot writes a row group per episode. That is costly when they are short: 20,000 of ten steps take 48 MB and 15 s to
@@ -55,8 +55,6 @@ def write_dataset(
 ) -> Path:
     """Write a LeRobotDataset into `root`, completely or not at all.
 
-    Everything is written into a hidden folder beside `root`, which takes the name `root` at the very end.
-
     Args:
         root: The dataset's folder: new, or an existing empty one.
         repo_id: Its name, as in `ME/NAME`.
@@ -81,10 +79,9 @@ def write_dataset(
     root = refuse_existing(root)
     lengths = np.asarray(lengths)
     _check_columns(features, columns, lengths)
-    partial = root.with_name(f".{root.name}.{uuid.uuid4().hex[:8]}.partial")
-    try:
+    with written_whole(root) as new:
         meta = LeRobotDatasetMetadata.create(
-            repo_id=repo_id, fps=fps, features=dict(features), robot_type=robot_type, root=partial
+            repo_id=repo_id, fps=fps, features=dict(features), robot_type=robot_type, root=new
         )
         tasks = [task] * len(lengths) if isinstance(task, str) else list(task)
         meta.save_episode_tasks(list(dict.fromkeys(tasks)))
@@ -93,27 +90,8 @@ def write_dataset(
         bar = tqdm(total=len(columns) + 3, desc=f"Writing {root.name}", unit="part", disable=None if progress else True)
         with bar:
             _write_all(meta, columns, lengths, tasks, bar)
-        _write_provenance(partial, provenance)
+        _write_provenance(new, provenance)
         _finish_info(meta, lengths)
-        with contextlib.suppress(FileNotFoundError):
-            root.rmdir()  # fails, as it should, if somebody has put something there by now
-        partial.rename(root)
-    except BaseException:  # Ctrl-C too
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    return root
-
-
-def refuse_existing(root: str | Path) -> Path:
-    """`root` as an absolute path, if a dataset may be written there.
-
-    Raises:
-        FileExistsError: If it exists and is not an empty folder.
-    """
-    root = Path(root).expanduser().resolve()
-    if root.exists() and not (root.is_dir() and not any(root.iterdir())):
-        kind = "folder is not empty" if root.is_dir() else "is a file"
-        raise FileExistsError(f"{root}: {kind}. Choose a new folder for the dataset, or remove this one first.")
     return root
 
 

@@ -7,19 +7,21 @@ is in its JSON.
 
 import dataclasses
 import json
+import multiprocessing
 import os
-import shlex
-import subprocess
+import re
 import sys
 import time
 from pathlib import Path
 
 import torch
+from lerobot.scripts import lerobot_eval, lerobot_train
+from tqdm import tqdm
 
 from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask.asking.answers import Answer
 from lerobot_unimask.data.episodes import first_windows, open_dataset
-from lerobot_unimask.envs.doorkey.panels import five_panels, predicted_states
+from lerobot_unimask.envs.doorkey.panels import DRAWN, five_panels, predicted_states
 from lerobot_unimask.envs.doorkey.pictures import draw_panels, state_distributions
 from lerobot_unimask.language.masks import TASKS
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
@@ -37,13 +39,7 @@ ROLLOUTS = 200
 # Random masks alone would do, with more updates: they hit the questions of acting rarely.
 MASKS = {"random_mask": 3, "goal_conditioned": 1, "reward_conditioned": 1}
 
-# What the console script does, without the page that LeRobot logs where FFmpeg, which only videos need, is missing.
-CONSOLE_SCRIPT = """
-import logging
-logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-from lerobot.scripts.{module} import main
-main()
-"""
+COMMANDS = {"lerobot-train": lerobot_train.main, "lerobot-eval": lerobot_eval.main}
 
 EXPERT = {"success_percent": 6.9, "mean_return": 3.04}
 
@@ -53,7 +49,7 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
 
     Raises:
         FileExistsError: `output` exists and is not an empty folder; it is left as it was.
-        ChildProcessError: one of LeRobot's commands failed; it has printed why.
+        ChildProcessError: one of LeRobot's commands failed; its log says why.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise FileExistsError(f"{output} exists and is not empty: give another folder, --output=DIR, or remove it.")
@@ -79,6 +75,8 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
     for panel in panels:
         achieved = ", ".join(f"{name} {values}" for name, values in panel.achieved.items())
         print(f"  {panel.name:16} {panel.question}  given {json.dumps(panel.given)}\n{'':19}{achieved}")
+        if panel.share is not None:
+            print(f"{'':19}of {DRAWN} rollouts with drawn actions {panel.share:.0%} do what is asked")
     answer = predicted_states(policy)
 
     _say(5, "Drawing the answers")
@@ -95,6 +93,7 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
         "episodes": {"training": EPISODES, "unseen": UNSEEN_EPISODES},
         "updates": steps,
         "rollouts": rollouts,
+        "drawn_rollouts": DRAWN,
         "expert": EXPERT,
         "loss_on_unseen_episodes": losses,
         "panels": [dataclasses.asdict(panel) for panel in panels],
@@ -113,6 +112,7 @@ def _say(number: int, what: str) -> None:
 def _train(output: Path, data: Path, steps: int) -> Path:
     """The folder of the trained checkpoint."""
     _run(
+        output / "train.log",
         "lerobot-train",
         "--policy.type=unimask",
         "--policy.push_to_hub=false",
@@ -130,6 +130,7 @@ def _train(output: Path, data: Path, steps: int) -> Path:
         "--env_eval_freq=0",
         "--num_workers=0",
         f"--output_dir={output / 'train'}",
+        total=steps,
     )
     return output / "train" / "checkpoints" / "last" / "pretrained_model"
 
@@ -144,6 +145,7 @@ def _evaluate(output: Path, checkpoint: Path) -> dict[str, dict]:
     for name, flags in questions.items():
         folder = output / "eval" / name.replace(", ", "_").replace(" ", "_")
         _run(
+            output / "eval.log",
             "lerobot-eval",
             f"--policy.path={checkpoint}",
             "--env.type=doorkey",
@@ -163,14 +165,44 @@ def _evaluate(output: Path, checkpoint: Path) -> dict[str, dict]:
     return rollouts
 
 
-def _run(script: str, *arguments: str) -> None:
-    """One of LeRobot's console scripts, with its own output."""
-    print(f"$ {shlex.join([script, *arguments])}", flush=True)
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}  # everything is local
-    command = [sys.executable, "-c", CONSOLE_SCRIPT.format(module=script.replace("-", "_")), *arguments]
-    done = subprocess.run(command, env=environment)
-    if done.returncode != 0:
-        raise ChildProcessError(f"{script} failed, with status {done.returncode}; what it printed says why.")
+def _run(log: Path, script: str, *arguments: str, total: int | None = None) -> None:
+    """One of LeRobot's console scripts, in a process of its own, which on Linux has imported everything already.
+
+    Args:
+        log: file that its output goes to.
+        total: number of steps of which LeRobot counts those made, for a bar.
+
+    Raises:
+        ChildProcessError: it failed.
+    """
+    print(f"  {script}; its output is in {log}", flush=True)
+    log.touch()
+    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    process = context.Process(target=_become, args=(log, script, *arguments))
+    process.start()
+    with tqdm(total=total, desc="  training", disable=None if total else True, leave=False) as bar:
+        while process.is_alive():
+            process.join(timeout=1)
+            bar.update(_steps_made(log) - bar.n)
+    if process.exitcode != 0:
+        raise ChildProcessError(f"{script} failed, with status {process.exitcode}; {log} says why.")
+
+
+def _become(log: Path, script: str, *arguments: str) -> None:
+    """Be a console script, with a log as output."""
+    sys.stdout = sys.stderr = log.open("a", buffering=1)
+    for number in (1, 2):
+        os.dup2(sys.stdout.fileno(), number)
+    sys.argv = [script, *arguments]
+    COMMANDS[script]()
+
+
+def _steps_made(log: Path) -> int:
+    """The number of steps that LeRobot's own bar shows last."""
+    with log.open("rb") as file:
+        file.seek(max(log.stat().st_size - 4096, 0))
+        counts = re.findall(rb" (\d+)/\d+ \[", file.read())
+    return int(counts[-1]) if counts else 0
 
 
 def _states(answer: Answer) -> dict:

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -68,10 +68,21 @@ def check(script: str, *arguments: str, cwd: Path, env: Mapping[str, str] | None
     return result.stdout + result.stderr
 
 
+def fresh(main: Callable[[], object]) -> Callable[[], None]:
+    """A command that finds nothing of what this process has set up for Accelerate."""
+
+    def command() -> None:
+        from accelerate.state import AcceleratorState, PartialState
+
+        AcceleratorState._reset_state(reset_partial_state=True)
+        PartialState._reset_state()
+        main()
+
+    return command
+
+
 def _be(main, words: list[str], cwd: Path, env: Mapping[str, str], out: io.TextIOBase, err: io.TextIOBase) -> int:
     """In the child: be the command, and return its exit status."""
-    from accelerate.state import AcceleratorState, PartialState
-
     status = 0
     try:
         os.dup2(out.fileno(), 1)
@@ -80,10 +91,8 @@ def _be(main, words: list[str], cwd: Path, env: Mapping[str, str], out: io.TextI
         sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(number, "wb", 0), write_through=True) for number in (1, 2))
         os.chdir(cwd)
         os.environ.update(env)
-        AcceleratorState._reset_state(reset_partial_state=True)
-        PartialState._reset_state()
         sys.argv = words
-        main()
+        fresh(main)()
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
         if isinstance(ended.code, str):

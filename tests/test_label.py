@@ -1,7 +1,9 @@
 """`unimask prepare`: the new column is right, everything else is untouched, and LeRobot reads the result."""
 
+import contextlib
 import json
 import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stat
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import dataset_builders.label
+from dataset_builders import folders
 from dataset_builders.label import add_label
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import cli
@@ -235,7 +238,7 @@ def test_a_commit_of_the_hub_stays_as_it_is(root, refused):
 
 
 @pytest.mark.parametrize("output", [None, "new"])
-@pytest.mark.parametrize("moment", ["_label_all", "_write_data", "_write_meta", "put_in_place"])
+@pytest.mark.parametrize("moment", ["_label_all", "_write_data", "_write_meta"])
 def test_an_interruption_leaves_nothing_half_written(moment, output, root, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -253,13 +256,43 @@ def test_the_old_dataset_comes_back_if_the_new_one_cannot_take_its_place(root, m
     before, rename = files(root), Path.rename
 
     def fail(path, target):
-        if path.name.endswith(".partial"):
+        if path.name == "new":
             raise OSError("no")
         return rename(path, target)
 
+    monkeypatch.setattr(folders, "_exchange", lambda new, target: False)  # a disk that cannot
     monkeypatch.setattr(Path, "rename", fail)
     with pytest.raises(OSError, match="no"):
         add_label(root, CORNER, lambda episode: 1, how="a test", progress=False)
+    assert files(root) == before
+    assert list(root.parent.iterdir()) == [root]
+
+
+def test_labels_that_are_added_at_the_same_time_are_all_there(root):
+    def label(number):
+        add_label(root, f"observation.label{number}", lambda episode: number, how="a test", progress=False)
+
+    threads = [threading.Thread(target=label, args=(number,)) for number in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    assert {f"observation.label{number}" for number in range(3)} <= features.keys()
+    assert list(root.parent.iterdir()) == [root]
+
+
+@pytest.mark.parametrize("left", ["new", "old"])
+def test_what_a_killed_run_left_is_tidied_by_the_next(root, left):
+    before = files(root)
+    work = root.with_name(f".{root.name}.partial")
+    if left == "new":  # killed while writing
+        (work / "new" / "meta").mkdir(parents=True)
+    else:  # killed between two renames, on a disk that cannot exchange folders
+        work.mkdir()
+        root.rename(work / "old")
+    with contextlib.suppress(FileExistsError), folders.written_whole(root):
+        pass
     assert files(root) == before
     assert list(root.parent.iterdir()) == [root]
 

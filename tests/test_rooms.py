@@ -72,6 +72,7 @@ FLOORS = [
     "lerobot_unimask/envs/metaworld/expert.py",
     "lerobot_unimask/envs/metaworld/record.py",
     "lerobot_unimask/envs/__init__.py",
+    "dataset_builders/folders.py",
     "dataset_builders/writer.py",
     "dataset_builders/label.py",
     "dataset_builders/prepare.py",

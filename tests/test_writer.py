@@ -10,7 +10,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.io_utils import load_nested_dataset
 
-from dataset_builders import writer
+from dataset_builders import folders, writer
 from dataset_builders.writer import PROVENANCE_PATH, episode_statistics, write_dataset
 
 FEATURES = {
@@ -235,13 +235,13 @@ def test_a_killed_build_leaves_nothing_that_looks_complete(tmp_path, monkeypatch
         raise SystemExit
 
     monkeypatch.setattr(writer, "_finish_info", kill)
-    monkeypatch.setattr(writer.shutil, "rmtree", lambda *_, **__: None)  # a killed process cleans nothing up
+    monkeypatch.setattr(folders.shutil, "rmtree", lambda *_, **__: None)  # a killed process cleans nothing up
     with pytest.raises(SystemExit):
         write(tmp_path / "new")
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".new")
     assert left.name.endswith(".partial")
-    assert json.loads((left / "meta/info.json").read_text())["total_episodes"] == 0
+    assert json.loads((left / "new/meta/info.json").read_text())["total_episodes"] == 0
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`unimask demo`: the main job from end to end."""
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    os.environ["HF_HUB_OFFLINE"] = "1"  # everything is local; the Hub's client reads this when it is imported
     from lerobot_unimask.demo import run_demo
 
     run_demo(arguments.output, **({"steps": arguments.steps} if arguments.steps else {}))

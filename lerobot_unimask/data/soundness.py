@@ -3,6 +3,7 @@
 Shapes: N frames, D numbers of a column.
 """
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,8 +37,9 @@ def check_columns(root: Path, columns: Mapping[str, Sequence[str]]) -> None:
             bad = ~np.isfinite(values)
             if bad.any():
                 raise ValueError(_describe(path, key, columns[key], bad, values))
-    marker.parent.mkdir(parents=True, exist_ok=True)
-    marker.touch()
+    with contextlib.suppress(OSError):  # a home that is read-only only costs the next look
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
 
 
 def _fingerprint(root: Path, files: Sequence[Path], columns: Mapping[str, Sequence[str]]) -> str:

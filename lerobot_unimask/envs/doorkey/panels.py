@@ -45,6 +45,8 @@ BACKWARDS_QUESTION = "s[:-1], a[:-1] | s[-1]"
 
 BACKWARDS_GIVEN = {"s[-1]": [GOAL, GOAL]}
 
+DRAWN = 100  # rollouts with drawn actions
+
 TRIES = 30  # to draw a token, and to start a history; a model that has learnt something needs one or two
 
 # The paper's figure of predicted states: from the bottom of the left room, over the key, into the door.
@@ -68,6 +70,9 @@ class Panel:
         achieved: What came of it. Of rollouts, a list with one entry for each: `return`, `success`, and for each given
             state whether they were in it at its step, as in `s[-1] reached`. Of samples: how many `possible histories`
             were found, and of these how many `tokens drawn`, those included that were `rejected` as impossible.
+        share: Of `DRAWN` rollouts from the same start, with actions drawn from the answers, the share that did what was
+            asked: it reached the given state, was paid the given return, or, where nothing is given, the goal. A given
+            one would always be met if the policy were exact. None of samples.
     """
 
     name: str
@@ -76,6 +81,7 @@ class Panel:
     states: list[list[list[int]]]
     actions: list[list[int]]
     achieved: dict[str, int | list[float] | list[bool]]
+    share: float | None = None
 
 
 def five_panels(policy: UniMASKPolicy, *, seed: int = 0) -> list[Panel]:
@@ -84,7 +90,7 @@ def five_panels(policy: UniMASKPolicy, *, seed: int = 0) -> list[Panel]:
 
     Args:
         policy: Trained on DoorKey, with a window of 10 steps.
-        seed: Of the samples.
+        seed: Of the samples and of drawn actions.
 
     Raises:
         ValueError: The policy's window is not one episode.
@@ -94,23 +100,34 @@ def five_panels(policy: UniMASKPolicy, *, seed: int = 0) -> list[Panel]:
             f"These questions are about whole episodes of {HORIZON} steps; this policy's context_length is "
             f"{policy.config.context_length}."
         )
-    panels = [rollout_panel(policy, name, question, given) for name, (question, given) in ROLLOUTS.items()]
+    panels = [rollout_panel(policy, name, question, given, seed=seed) for name, (question, given) in ROLLOUTS.items()]
     return [*panels, backwards_panel(policy, seed=seed)]
 
 
 def rollout_panel(
-    policy: UniMASKPolicy, name: str, question: str, given: Given, *, start: Sequence[int] = START
+    policy: UniMASKPolicy, name: str, question: str, given: Given, *, start: Sequence[int] = START, seed: int = 0
 ) -> Panel:
-    """Ask `question` at every step of one episode in the real environment, and take the most likely actions."""
+    """Ask `question` at every step of one episode in the real environment, and take the most likely actions; and of
+    `DRAWN` more, with drawn actions, for the share that does what is asked."""
     episodes = rollout(policy, [start], question, given)
-    states = np.stack([episodes.agent, episodes.key], axis=-1)[:, :HORIZON]  # (1, K, 2)
-    achieved = {
-        "return": episodes.reward.sum(axis=1).astype(float).tolist(),
-        "success": (episodes.agent == GOAL).any(axis=1).tolist(),
-    }
-    return Panel(
-        name, question, dict(given), states.tolist(), episodes.action.tolist(), achieved | _reached(states, given)
-    )
+    drawn = rollout(policy, [start] * DRAWN, question, given, sample=True, seed=seed)
+    share = float(did_as_asked(_achieved(drawn, given), given).mean())
+    achieved = _achieved(episodes, given)
+    return Panel(name, question, dict(given), _window(episodes).tolist(), episodes.action.tolist(), achieved, share)
+
+
+def did_as_asked(achieved: Mapping[str, Sequence[float]], given: Given) -> np.ndarray:
+    """Which rollouts reached every given state and were paid the given return, or, where nothing is given, succeeded.
+
+    Args:
+        achieved: As in a `Panel` of N rollouts.
+
+    Returns:
+        (N,) bool.
+    """
+    reached = [np.asarray(values) for name, values in achieved.items() if name.endswith(" reached")]
+    paid = [np.asarray(achieved["return"]) == value for token, value in given.items() if token.startswith("rtg")]
+    return np.all(reached + paid if given else [np.asarray(achieved["success"])], axis=0)
 
 
 def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> Panel:
@@ -227,6 +244,18 @@ def given_states(given: Given, context_length: int) -> dict[str, tuple[int, Sequ
         for token, value in given.items()
         if token.partition("[")[0].strip() == "s"
     }
+
+
+def _window(episodes: Episodes) -> np.ndarray:
+    """The window's states, (N, K, 2)."""
+    return np.stack([episodes.agent, episodes.key], axis=-1)[:, :HORIZON]
+
+
+def _achieved(episodes: Episodes, given: Given) -> dict[str, list[float] | list[bool]]:
+    return {
+        "return": episodes.reward.sum(axis=1).astype(float).tolist(),
+        "success": (episodes.agent == GOAL).any(axis=1).tolist(),
+    } | _reached(_window(episodes), given)
 
 
 def _reached(states: np.ndarray, given: Given) -> dict[str, list[bool]]:

@@ -180,7 +180,7 @@ def _draw_given(axes: Axes, panel: Panel, steps: int) -> None:
 
 
 def _outcome(panel: Panel) -> str:
-    """What came of a panel's question, in a line."""
+    """What came of a panel's question, in a line; and how often drawn actions do what it asks, in another."""
     reached = {name: all(values) for name, values in panel.achieved.items() if name.endswith(" reached")}
     words = [name if met else f"{name.removesuffix(' reached')} missed" for name, met in reached.items()]
     if "return" in panel.achieved:
@@ -192,7 +192,8 @@ def _outcome(panel: Panel) -> str:
     if "possible histories" in panel.achieved:
         found = panel.achieved["possible histories"]
         words.append(f"{found} possible histories" if found else "no possible history found")
-    return ", ".join(words)
+    drawn = [] if panel.share is None else [f"drawn actions: {panel.share:.0%}"]
+    return "\n".join([", ".join(words), *drawn])
 
 
 def _grid_handles() -> list[Patch | Line2D]:
