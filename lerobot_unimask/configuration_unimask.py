@@ -20,6 +20,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot_unimask.data.factors import (
     TASK,
     Camera,
+    Factor,
     Feature,
     check_layout,
     colour_cameras,
@@ -27,6 +28,7 @@ from lerobot_unimask.data.factors import (
     describe_features,
     group_features,
     is_numeric,
+    make_factors,
     name_cameras,
     read_feature,
 )
@@ -45,6 +47,7 @@ NETWORKS = {
     "decision_transformer": ("causal",),
 }
 TOKEN_LAYOUTS = ("stacked", "separate")
+DISCRETE_HEADS = ("joint", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
 UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
 # More is a damaged file, or a slip
@@ -56,7 +59,7 @@ class FormatVersion(int):
     fields that a newer format has and this code does not know."""
 
 
-FORMAT_VERSION = FormatVersion(2)  # of a checkpoint's files; it grows when older code would misread them
+FORMAT_VERSION = FormatVersion(3)  # of a checkpoint's files; it grows when older code would misread them
 
 
 @decode.register(FormatVersion)
@@ -75,7 +78,7 @@ def _read_format(value: Any, path: Sequence[str] = ()) -> FormatVersion:
             "This checkpoint has format 1. UniMASKPolicy.from_pretrained(FOLDER) reads it, and "
             ".save_pretrained(FOLDER) then saves it in today's format.",
         )
-    return FORMAT_VERSION
+    return FormatVersion(value)
 
 
 @PreTrainedConfig.register_subclass("unimask")
@@ -136,6 +139,10 @@ class UniMASKConfig(PreTrainedConfig):
     state_residuals: bool = True
     """Whether continuous states are predicted as departures from the straight course of those shown; False: as plain
     values, the paper's."""
+    discrete_head: str | None = None
+    """What is predicted of a token's discrete numbers: "joint", one distribution over all combinations of their
+    categories, where there are at most 1,024, or "separate", the paper's: one for each number. None: joint; in a
+    checkpoint of format 2 or older, separate."""
     continuous_head: str = "gaussian"
     """What is predicted of continuous values: "gaussian", a mean and a scale, or "l2", the paper's: a mean by the
     squared error, which hardly notices what is nearly certain, such as states some steps ahead."""
@@ -226,9 +233,13 @@ class UniMASKConfig(PreTrainedConfig):
             raise ValueError(f"network is {self.network!r}; choose one of {', '.join(NETWORKS)}.")
         if self.attention is None:
             self.attention = NETWORKS[self.network][0]
+        if self.discrete_head is None:
+            self.discrete_head = "joint" if self.format_version > 2 else "separate"
+        self.format_version = FORMAT_VERSION
         for name, choices in {
             "attention": NETWORKS[self.network],
             "token_layout": TOKEN_LAYOUTS,
+            "discrete_head": DISCRETE_HEADS,
             "continuous_head": CONTINUOUS_HEADS,
         }.items():
             if getattr(self, name) not in choices:
@@ -273,6 +284,12 @@ class UniMASKConfig(PreTrainedConfig):
             if text != RANDOM_MASK:
                 parse(text)
         parse(self.inference_mask)
+
+    def make_factors(self) -> dict[str, Factor]:
+        """The model's factors, and how the heads predict them."""
+        return make_factors(
+            self.features, joint=self.discrete_head == "joint", gaussian=self.continuous_head == "gaussian"
+        )
 
     # LeRobot's contract
 
@@ -377,6 +394,7 @@ def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
     content = {name: value for name, value in content.items() if name != "causal_draw"}
     content["n_obs_steps"] = None  # LeRobot's own default, 1, stands in all of them, and nothing read it
     content["state_residuals"] = content.get("fine_inputs", True)
+    content["discrete_head"] = "separate"
     content["format_version"] = int(FORMAT_VERSION)
     if content.get("network") == "decision_gpt":
         content |= {"network": "transformer", "attention": "causal", "token_layout": "separate"}

@@ -17,7 +17,7 @@ from torch import Tensor
 from lerobot_unimask.asking.answers import answer as answer_question
 from lerobot_unimask.data.checkpoints import episodes_trained_on
 from lerobot_unimask.data.episodes import bounds_of, read_windows
-from lerobot_unimask.data.factors import RETURN_SO_FAR, Component
+from lerobot_unimask.data.factors import RETURN_SO_FAR, Output
 from lerobot_unimask.language.masks import Mask, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
@@ -87,7 +87,7 @@ def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
 @torch.no_grad()
 def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str) -> float:
     """The mean Kullback-Leibler divergence, in nats, from the causal answer about an action to that in both directions,
-    over all windows and steps t, components added up. An L2 head counts as a Gaussian of the data's scale."""
+    over all windows and steps t, outputs added up. An L2 head counts as a Gaussian of the data's scale."""
     policy.eval()
     window = policy.statistics.normalise(policy.make_window(batch))
     table = tabulate(question, tuple(policy.factors), policy.config.context_length)
@@ -95,20 +95,18 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     for t in table.t.tolist():
         mask: Mask = table.at(t, len(window.valid)).to(policy.device).within(window.valid)
         causal, both = (policy.network(window, mask.shown, direction)["a"] for direction in (True, False))
-        components = policy.factors["a"].components
-        parts = [
-            _divergence(p[:, t], q[:, t], component) for p, q, component in zip(causal, both, components, strict=True)
-        ]
+        outputs = policy.factors["a"].outputs
+        parts = [_divergence(p[:, t], q[:, t], output) for p, q, output in zip(causal, both, outputs, strict=True)]
         found.append(sum(parts)[mask.asked["a"][:, t]])
     return torch.cat(found).mean().item()
 
 
-def _divergence(p: Tensor, q: Tensor, component: Component) -> Tensor:
+def _divergence(p: Tensor, q: Tensor, output: Output) -> Tensor:
     """(B, size) of two networks' outputs -> (B,)"""
-    if component.discrete:
+    if output.discrete:
         p, q = p.log_softmax(-1), q.log_softmax(-1)
         return (p.exp() * (p - q)).sum(-1)
-    if not component.gaussian:
+    if not output.gaussian:
         return (p - q).square().sum(-1) / 2
     (mean_p, scale_p), (mean_q, scale_q) = p.chunk(2, dim=-1), q.chunk(2, dim=-1)
     apart = (2 * (scale_p - scale_q)).exp() + ((mean_p - mean_q) * (-scale_q).exp()).square()

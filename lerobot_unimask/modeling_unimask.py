@@ -27,7 +27,7 @@ from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, read_weights
-from lerobot_unimask.data.factors import TASK, make_factors
+from lerobot_unimask.data.factors import TASK
 from lerobot_unimask.data.returns import EpisodeStarts
 from lerobot_unimask.data.soundness import check_loss, check_saved
 from lerobot_unimask.data.taking_over import take_over
@@ -73,7 +73,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         config.validate_features()
         if dataset_meta is not None and TASK not in config.features:
             config.add_tasks(list(dataset_meta.tasks.index))
-        self.factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
+        self.factors = config.make_factors()
         self.cameras = config.pictures
         check_settings(config, self.factors)
         self.statistics = Statistics(config.features, self.factors, config.context_length)
@@ -341,8 +341,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         config = config or read_config(folder)
         config.validate_features()
         with torch.device("meta"):
-            factors = make_factors(config.features, gaussian=config.continuous_head == "gaussian")
-            network = make_network(config, factors, load_backbone=False)
+            network = make_network(config, config.make_factors(), load_backbone=False)
         check_header(folder / WEIGHTS, network.state_dict(prefix="network."))
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)

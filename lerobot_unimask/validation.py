@@ -40,7 +40,7 @@ def answered(policy: UniMASKPolicy, batch: dict[str, Tensor]) -> list[str]:
 
 @torch.no_grad()
 def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable[str]) -> dict[str, float]:
-    """Mask text -> loss in nats, s and a added with weight 1."""
+    """Mask text -> loss in nats, s and a added with weight 1; of each component's marginal, as the paper has it."""
     policy.eval()
     window = policy.make_window(batch)
     normalised = policy.statistics.normalise(window)
@@ -48,7 +48,7 @@ def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable
     for text in masks:
         mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"])
         predictions = policy.predict(normalised, mask)
-        parts = masked_losses(predictions, normalised, mask.asked, policy.factors)
+        parts = masked_losses(predictions, normalised, mask.asked, policy.factors, apart=True)
         losses[text] = sum(part.item() for part in parts.values())
     return losses
 
@@ -57,7 +57,7 @@ def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable
 def probability_of_truth(policy: UniMASKPolicy, batch: dict[str, Tensor], text: str) -> float:
     """The probability that the policy puts on what was recorded, its mean over the asked-for tokens of all windows.
 
-    Of one task with discrete factors; a token's components are independent, so their probabilities multiply.
+    Of one task with discrete factors; outputs of a token are independent, so their probabilities multiply.
     """
     window = policy.make_window(batch)
     mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"])
@@ -67,8 +67,7 @@ def probability_of_truth(policy: UniMASKPolicy, batch: dict[str, Tensor], text: 
         asked = mask.asked[name]
         token = torch.ones(int(asked.sum()), device=policy.device)
         for distribution in distributions:
-            truth = window.values[name][..., distribution.component.dims].long()
-            token = token * distribution.probabilities.gather(-1, truth).squeeze(-1)[asked]
+            token = token * distribution.probability(window.values[name].nan_to_num())[asked]
         probabilities.append(token)
     return torch.cat(probabilities).mean().item()
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import make_policy
-from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same_answers, roll
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same_answers, random_question, roll
 from safetensors.torch import load_file, save_file
 
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
@@ -270,6 +270,21 @@ def test_lerobots_own_commands_say_how_to_bring_format_1_up_to_date():
     with pytest.raises(Exception, match="save_pretrained") as raised:
         PreTrainedConfig.from_pretrained(FORMAT_1[0])
     assert "format 1" in str(raised.value)
+
+
+def test_a_checkpoint_of_format_2_predicts_a_tokens_numbers_separately(tiny_policy, doorkey_batch, tmp_path):
+    """It says nothing of discrete heads; LeRobot's own commands read it too."""
+    policy = tiny_policy(discrete_head="separate")
+    policy.save_pretrained(tmp_path)
+    content = json.loads((tmp_path / "config.json").read_text())
+    assert content.pop("discrete_head") == "separate"
+    (tmp_path / "config.json").write_text(json.dumps(content | {"format_version": 2}))
+    loaded = UniMASKPolicy.from_pretrained(tmp_path)
+    window, mask = random_question(policy, doorkey_batch, 0)
+    assert_same_answers(loaded.infer(window, mask), policy.infer(window, mask))
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    assert (config.discrete_head, config.format_version) == ("separate", loaded.config.format_version)
+    assert [output.size for output in tiny_policy().factors["s"].outputs] == [256]
 
 
 def test_another_kind_of_policy_is_named(tmp_path):

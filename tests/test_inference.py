@@ -270,6 +270,31 @@ def test_a_draw_follows_the_probabilities():
         assert statistic < df + 5 * (2 * df) ** 0.5 + 10
 
 
+def test_a_tokens_numbers_are_answered_together():
+    """The likeliest token is not made of the likeliest numbers, and no combination is drawn that has no probability."""
+    features = {"s": [Feature("observation.state", 2, [2, 3])], "a": [Feature("action", 1, [2])]}
+    factors, B = make_factors(features, joint=True), 2000
+    table = torch.tensor([[0.4, 0.0, 0.0], [0.0, 0.3, 0.3]])
+
+    def network(window, mask, cache=None):
+        return {"s": [table.flatten().log().expand(B, K, 6)], "a": [torch.zeros(B, K, 2)]}
+
+    window = Window({"s": torch.full((B, K, 2), 1.0), "a": torch.zeros(B, K, 1)}, torch.ones(B, K).bool())
+    mask = tabulate("s[1] | s[0]", ("s", "a"), K).at(None, B)
+    said = answer(model(network, factors=factors), window, mask)
+    first, second = said["s"]
+    assert first.probabilities[0].tolist() == [[0, 1], pytest.approx([0.4, 0.6])]  # shown, asked
+    assert second.probabilities[0].tolist() == [[0, 1, 0], pytest.approx([0.4, 0.3, 0.3])]
+    assert [d.most_likely[0, 1].item() for d in said["s"]] == [1, 0]
+    assert said.most_likely("s")[0].tolist() == [[1, 1], [0, 0]]
+    drawn = said.draw("s", torch.Generator().manual_seed(0))
+    assert (drawn[:, 0] == 1).all()
+    counts = factors["s"].outputs[0].combination(drawn[:, 1]).bincount(minlength=6).float()
+    statistic, df = chi_square(counts, table.flatten())
+    assert (counts[table.flatten() == 0] == 0).all()
+    assert statistic < df + 5 * (2 * df) ** 0.5 + 10
+
+
 def test_continuous_answers_are_in_the_datasets_units():
     features = {"s": [Feature("observation.state", 2)], "a": [Feature("action", 1)]}
     factors = make_factors(features)

@@ -1,5 +1,6 @@
 """The loss against a loop over tokens."""
 
+import itertools
 import math
 
 import pytest
@@ -7,7 +8,8 @@ import torch
 
 from lerobot_unimask.data.factors import Feature, make_factors
 from lerobot_unimask.data.window import Window
-from lerobot_unimask.networks.losses import component_loss, masked_losses
+from lerobot_unimask.networks.layers import by_component
+from lerobot_unimask.networks.losses import masked_losses, output_loss
 
 B, K = 5, 4
 FEATURES = {
@@ -31,7 +33,7 @@ def make_question(factors):
         "a": torch.randn(B, K, 2, generator=generator),
     }
     predictions = {
-        name: [torch.randn(B, K, c.size, generator=generator).requires_grad_() for c in factor.components]
+        name: [torch.randn(B, K, o.size, generator=generator).requires_grad_() for o in factor.outputs]
         for name, factor in factors.items()
     }
     asked = {name: torch.rand(B, K, generator=generator) < 0.4 for name in FACTORS}
@@ -47,12 +49,13 @@ def slow_losses(predictions, window, asked, factors):
                 if not asked[name][b, k]:
                     continue
                 value = window.values[name][b, k].tolist()
-                for output, component in zip(predictions[name], factor.components, strict=True):
-                    numbers = output[b, k].tolist()
-                    target = value[component.dims]
-                    if component.discrete:
-                        cost = math.log(sum(math.exp(n) for n in numbers)) - numbers[int(target[0])]
-                    elif component.gaussian:
+                for prediction, output in zip(predictions[name], factor.outputs, strict=True):
+                    numbers = prediction[b, k].tolist()
+                    target = [value[number] for number in output.numbers]
+                    if output.discrete:
+                        combinations = list(itertools.product(*map(range, output.categories)))
+                        cost = math.log(sum(math.exp(n) for n in numbers)) - numbers[combinations.index(tuple(target))]
+                    elif output.gaussian:
                         means, logarithms = numbers[: len(target)], numbers[len(target) :]
                         densities = [
                             math.exp(-(((v - m) / math.exp(s)) ** 2) / 2) / math.sqrt(2 * math.pi) / math.exp(s)
@@ -65,9 +68,9 @@ def slow_losses(predictions, window, asked, factors):
     return losses
 
 
-@pytest.mark.parametrize("gaussian", [False, True])
-def test_the_loss_is_that_of_a_loop_over_tokens(gaussian):
-    factors = make_factors(FEATURES, gaussian=gaussian)
+@pytest.mark.parametrize("how", [{}, {"gaussian": True}, {"joint": True}, {"joint": True, "gaussian": True}])
+def test_the_loss_is_that_of_a_loop_over_tokens(how):
+    factors = make_factors(FEATURES, **how)
     question = make_question(factors)
     fast = masked_losses(*question, factors)
     for name, loss in slow_losses(*question, factors).items():
@@ -75,23 +78,41 @@ def test_the_loss_is_that_of_a_loop_over_tokens(gaussian):
         assert loss > 0
 
 
+def test_a_joint_predictions_marginals_cost_what_tables_say():
+    """Of logits over 5 x 3 combinations of cells; beside the paper each cell counts by itself."""
+    factors = make_factors(FEATURES, joint=True)
+    (predictions, window, asked) = make_question(factors)
+    together = masked_losses(predictions, window, asked, factors)["s"]
+    apart = masked_losses(predictions, window, asked, factors, apart=True)["s"]
+    table = predictions["s"][0].detach().softmax(-1).view(B, K, 5, 3)
+    agent, key = window.values["s"][..., :2].long().unbind(-1)
+    joint, of_agent, of_key = (torch.zeros(B, K) for _ in range(3))
+    for b, k in itertools.product(range(B), range(K)):
+        joint[b, k] = table[b, k, agent[b, k], key[b, k]]
+        of_agent[b, k], of_key[b, k] = table[b, k, agent[b, k]].sum(), table[b, k, :, key[b, k]].sum()
+    difference = (joint.log() - of_agent.log() - of_key.log())[asked["s"]].mean()
+    assert (apart - together).item() == pytest.approx(difference.item(), rel=1e-4)
+    for part, size in zip(by_component(predictions, factors)["s"], (5, 3, 3), strict=True):
+        assert part.shape == (B, K, size)
+
+
 def test_a_gaussians_scale_is_bounded():
-    component = make_factors(FEATURES, gaussian=True)["a"].components[0]
+    output = make_factors(FEATURES, gaussian=True)["a"].outputs[0]
     value = torch.tensor([[[1.0, -1.0]]])
     for log_scale in (-1e6, 1e6):
         prediction = torch.tensor([[[1.0, -1.0, log_scale, log_scale]]], requires_grad=True)
-        loss = component_loss(prediction, value, component).sum()
+        loss = output_loss(prediction, value, output).sum()
         loss.backward()
         assert loss.isfinite()
         assert prediction.grad.isfinite().all()
 
 
 def test_a_gaussians_gradient_is_that_of_its_likelihood_times_its_scale():
-    component = make_factors(FEATURES, gaussian=True)["a"].components[0]
+    output = make_factors(FEATURES, gaussian=True)["a"].outputs[0]
     generator = torch.Generator().manual_seed(0)
     value = torch.randn(B, K, 2, generator=generator)
     mean, log_scale = (torch.randn(B, K, 2, generator=generator).requires_grad_() for _ in range(2))
-    component_loss(torch.cat([mean, log_scale], dim=-1), value, component).sum().backward()
+    output_loss(torch.cat([mean, log_scale], dim=-1), value, output).sum().backward()
     density = torch.distributions.Normal(mean, log_scale.exp()).log_prob(value).mean(-1)
     for numbers, gradient in zip(
         (mean, log_scale), torch.autograd.grad(-density.sum(), (mean, log_scale)), strict=True
@@ -101,12 +122,12 @@ def test_a_gaussians_gradient_is_that_of_its_likelihood_times_its_scale():
 
 def test_a_perfect_prediction_costs_nothing():
     value = torch.tensor([[[2.0, 1.0, 0.5, -1.0, 3.0]]])
-    agent, _, numbers = FACTORS["s"].components
+    agent, _, numbers = FACTORS["s"].outputs
     certain = torch.full((1, 1, 5), -100.0)
     certain[..., 2] = 100.0
-    assert component_loss(certain, value, agent).item() == 0
-    assert component_loss(value[..., 2:], value, numbers).item() == 0
-    assert component_loss(torch.zeros(1, 1, 5), value, agent).item() == pytest.approx(math.log(5))
+    assert output_loss(certain, value, agent).item() == 0
+    assert output_loss(value[..., 2:], value, numbers).item() == 0
+    assert output_loss(torch.zeros(1, 1, 5), value, agent).item() == pytest.approx(math.log(5))
 
 
 def test_what_is_not_asked_does_not_matter_not_even_a_nan(question):

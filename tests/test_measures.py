@@ -11,7 +11,7 @@ from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.cli import main
 from lerobot_unimask.data.episodes import open_dataset
-from lerobot_unimask.data.factors import Component
+from lerobot_unimask.data.factors import Component, Output
 from lerobot_unimask.measures import (
     _divergence,
     action_error,
@@ -87,12 +87,12 @@ def test_the_action_error_is_that_of_the_answers_to_each_step(make, root):
 def test_divergences_are_those_of_torch():
     torch.manual_seed(0)
     p, q = torch.randn(2, 20, 4)
-    categorical = _divergence(p, q, Component("a", slice(0, 1), 4))
+    categorical = _divergence(p, q, Output((Component("a", slice(0, 1), 4),)))
     torch.testing.assert_close(categorical, kl_divergence(Categorical(logits=p), Categorical(logits=q)))
-    gaussian = _divergence(p, q, Component("a", slice(0, 2), None, gaussian=True))
+    gaussian = _divergence(p, q, Output((Component("a", slice(0, 2), None),), gaussian=True))
     normals = [Normal(x[:, :2], x[:, 2:].exp()) for x in (p, q)]
     torch.testing.assert_close(gaussian, kl_divergence(*normals).sum(-1))
-    unit = _divergence(p, q, Component("a", slice(0, 4), None))
+    unit = _divergence(p, q, Output((Component("a", slice(0, 4), None),)))
     torch.testing.assert_close(unit, kl_divergence(Normal(p, 1.0), Normal(q, 1.0)).sum(-1))
 
 

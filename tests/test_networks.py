@@ -31,7 +31,7 @@ KINDS = {
 
 
 def make_network(kind, layout, dropout=0.0):
-    factors = make_factors(KINDS[kind])
+    factors = make_factors(KINDS[kind], joint=kind == "mixed")
     torch.manual_seed(0)
     network = Transformer(
         factors,
@@ -55,7 +55,7 @@ def random_window(factors, seed=0):
         parts = [
             torch.randint(0, c.categories, (B, K, 1), generator=generator).float()
             if c.discrete
-            else torch.randn(B, K, c.size, generator=generator)
+            else torch.randn(B, K, c.dims.stop - c.dims.start, generator=generator)
             for c in factor.components
         ]
         values[name] = torch.cat(parts, dim=-1)
@@ -87,12 +87,12 @@ def layout(request):
     return request.param
 
 
-def test_one_output_for_each_component(kind, layout):
+def test_predictions_have_the_outputs_sizes(kind, layout):
     network, factors = make_network(kind, layout)
     predictions = network(random_window(factors), random_shown(factors))
     assert list(predictions) == ["s", "a"]
     for name, outputs in predictions.items():
-        assert [tuple(o.shape) for o in outputs] == [(B, K, c.size) for c in factors[name].components]
+        assert [tuple(o.shape) for o in outputs] == [(B, K, o.size) for o in factors[name].outputs]
 
 
 def test_a_hidden_value_changes_nothing_not_even_a_nan(kind, layout):

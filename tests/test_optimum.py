@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_unimask.asking.sampling import sample
+from lerobot_unimask.data.factors import make_factors
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.envs.doorkey import optimum as module
 from lerobot_unimask.envs.doorkey.episodes import Episodes, rollout
 from lerobot_unimask.envs.doorkey.expert import expert_probabilities
 from lerobot_unimask.envs.doorkey.optimum import (
     FACTORS,
+    FEATURES,
     Optimum,
     divergences,
     entropies,
@@ -21,9 +24,10 @@ from lerobot_unimask.envs.doorkey.optimum import (
     mean_over_asked,
     random_mask_divergence,
 )
-from lerobot_unimask.envs.doorkey.rules import DOOR, GOAL, START_PAIRS, distance_to_goal, reward, step
+from lerobot_unimask.envs.doorkey.rules import DOOR, GOAL, START_PAIRS, DynamicsCheck, distance_to_goal, reward, step
 from lerobot_unimask.language.masks import TASKS, Mask, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.networks.layers import by_component
 from lerobot_unimask.networks.losses import masked_losses
 
 EXPERTS = ("paper", "released")
@@ -102,7 +106,7 @@ def count(episodes: Episodes, weight: np.ndarray, window: Window, shown: dict, f
 
 def marginals(window: Window, shown: dict, **settings) -> dict[str, np.ndarray]:
     """The first window's, (K, categories) each."""
-    predictions = Optimum(**settings).predict(window, showing(shown))
+    predictions = by_component(Optimum(**settings).predict(window, showing(shown)), FACTORS)
     (agent, key), (action,) = predictions["s"], predictions["a"]
     return {name: part[0].exp().numpy() for name, part in (("agent", agent), ("key", key), ("action", action))}
 
@@ -133,7 +137,7 @@ def test_marginals_equal_enumeration(monkeypatch, expert, horizon, first, K):
     windows = window_of(states, episodes.action[chosen, first : first + K], returns, first / horizon)
     shown = {name: torch.from_numpy(rng.random((60, K)) < rng.random((60, 1))) for name in ("s", "a")}
     shown["rtg"] = (torch.arange(60)[:, None] % 2 == 0) & (torch.arange(K) == 0)
-    together = Optimum(expert, first_step=first).predict(windows, showing(shown))
+    together = by_component(Optimum(expert, first_step=first).predict(windows, showing(shown)), FACTORS)
     for b in range(60):
         one = {name: value[b : b + 1] for name, value in shown.items()}
         expected, _ = count(episodes, probability, row(windows, b), one, first)
@@ -249,6 +253,26 @@ def test_steps_past_the_episodes_end_are_not_seen(recorded):
     torch.testing.assert_close(one["a"][0], other["a"][0][:, :3])
 
 
+@pytest.mark.parametrize("order", ["forward", "backward", "random"])
+def test_its_draws_are_possible_histories_in_any_order(order):
+    """A state is drawn as one token, so nothing need be checked; how often it occurs does not depend on the order."""
+    B = 400
+    nothing = Window(
+        {name: torch.full((B, 10, f.size), torch.nan) for name, f in FACTORS.items()}, torch.ones(B, 10) > 0
+    )
+    generator = torch.Generator().manual_seed(0)
+    drawn = sample(Optimum(), nothing, mask_of("s[:], a[:] |", B=B), order=order, generator=generator)
+    decided = {name: torch.ones(B, 10, dtype=torch.bool) for name in ("s", "a")}
+    assert DynamicsCheck()(drawn.values, decided).all()
+    played = rollout(20_000, np.random.default_rng(2))
+    cells = FACTORS["s"].outputs[0]
+    for k in (1, 5, 9):
+        found = cells.combination(drawn.values["s"][:, k]).bincount(minlength=256) / B
+        state = torch.from_numpy(np.stack([played.agent[:, k], played.key[:, k]], axis=-1))
+        expected = cells.combination(state).bincount(minlength=256) / 20_000
+        assert (found - expected).abs().max() < 0.1
+
+
 # --- The measures ----------------------------------------------------------------------------------------------------
 
 
@@ -260,16 +284,17 @@ def test_its_loss_is_the_entropy_in_expectation_and_no_answer_is_better():
     window = window_of(states, episodes.action, episodes.reward.sum(axis=1))
     for text in TASKS:
         mask = TrainingMasks(text, tuple(FACTORS), 10)(window.valid, torch.arange(4000) * 10, seed=0, step=-1)
-        exact = Optimum().predict(window, mask)
-        loss = sum(part.item() for part in masked_losses(exact, window, mask.asked, FACTORS).values())
+        exact = by_component(Optimum().predict(window, mask), FACTORS)
+        apart = make_factors(FEATURES)
+        loss = sum(part.item() for part in masked_losses(exact, window, mask.asked, apart).values())
         expected = mean_over_asked(entropies(exact), mask.asked)
         assert math.isfinite(loss)
         assert loss == pytest.approx(expected, abs=0.05)
         softer = {name: [part.clamp_min(-8) / 2 for part in parts] for name, parts in exact.items()}
-        apart = mean_over_asked(divergences(exact, softer), mask.asked)
-        other = sum(part.item() for part in masked_losses(softer, window, mask.asked, FACTORS).values())
-        assert apart > 0
-        assert other - loss == pytest.approx(apart, abs=0.05)
+        distance = mean_over_asked(divergences(exact, softer), mask.asked)
+        other = sum(part.item() for part in masked_losses(softer, window, mask.asked, apart).values())
+        assert distance > 0
+        assert other - loss == pytest.approx(distance, abs=0.05)
 
 
 def test_divergence_is_zero_from_itself_and_the_textbooks_otherwise():
@@ -286,7 +311,8 @@ def test_random_masks_are_measured_by_kind_and_by_what_they_hide(recorded):
         return {"s": [torch.zeros(60, 10, 16)] * 2, "a": [torch.zeros(60, 10, 4)]}
 
     exact = random_mask_divergence(Optimum(), Optimum(), recorded, recorded, index, draws=2)
-    found = random_mask_divergence(Optimum(), SimpleNamespace(predict=uniform), recorded, recorded, index, draws=2)
+    model = SimpleNamespace(predict=uniform, factors=make_factors(FEATURES))
+    found = random_mask_divergence(Optimum(), model, recorded, recorded, index, draws=2)
     assert found.keys() == exact.keys() == {"agent_cell", "key_cell", "direction"}
     for label, size in (("agent_cell", 16), ("key_cell", 16), ("direction", 4)):
         assert set(found[label]) == {"0-0.2", "0.2-0.4", "0.4-0.6", "0.6-0.8", "0.8-1", "all"}

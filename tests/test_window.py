@@ -50,11 +50,22 @@ def test_factors_say_what_each_number_is():
         "a": (1, 1),
         "rtg": (2, 1),  # the timestep is not given by a user
     }
-    assert [(c.name, c.dims, c.categories, c.size) for c in factors["s"].components] == [
+    assert [(c.name, c.dims, c.categories, o.size) for o in factors["s"].outputs for c in o.components] == [
         ("agent", slice(0, 1), 16, 16),
         ("key", slice(1, 2), 8, 8),
         ("environment_state", slice(2, 5), None, 3),
     ]
+
+
+def test_discrete_numbers_of_a_token_make_one_output_where_their_combinations_are_few():
+    (cells, numbers) = make_factors(FEATURES, joint=True)["s"].outputs
+    assert (cells.size, cells.numbers, numbers.size, numbers.numbers) == (128, [0, 1], 3, [2, 3, 4])
+    values = torch.cartesian_prod(torch.arange(16), torch.arange(8))
+    assert torch.equal(cells.combination(values), torch.arange(128))
+    assert torch.equal(cells.split(torch.arange(128)), values)
+    for categories, sizes in (([32, 32], [1024]), ([32, 33], [32, 33]), ([1024], [1024])):
+        features = {"s": [Feature("observation.state", len(categories), categories)]}
+        assert [output.size for output in make_factors(features, joint=True)["s"].outputs] == sizes
 
 
 def test_a_window_holds_the_batchs_numbers():
@@ -157,22 +168,22 @@ def test_normalising_and_back_is_the_identity():
     slow = (window.values["s"][1, 2, 3].item() + 20) / 10
     assert normalised.values["s"][1, 2, 3].item() == pytest.approx(slow)
     for name, factor in make_factors(FEATURES).items():
-        for component in factor.components:
-            value = normalised.values[name][..., component.dims]
-            back, scale = statistics.denormalise(name, component, value)
+        for output in factor.outputs:
+            value = normalised.values[name][..., output.numbers]
+            back, scale = statistics.denormalise(name, output, value)
             assert scale is None
-            torch.testing.assert_close(back, window.values[name][..., component.dims])
-            if component.discrete:
-                assert torch.equal(value, window.values[name][..., component.dims])
+            torch.testing.assert_close(back, window.values[name][..., output.numbers])
+            if output.discrete:
+                assert torch.equal(value, window.values[name][..., output.numbers])
 
 
 def test_a_gaussians_scale_is_in_the_datasets_units():
     statistics = make_statistics()
     statistics.fill(STATS)
-    component = make_factors(FEATURES, gaussian=True)["s"].components[-1]
-    assert component.size == 6
-    output = torch.tensor([0.0, 1.0, 2.0, 0.0, torch.tensor(3.0).log(), 0.0])
-    mean, scale = statistics.denormalise("s", component, output)
+    output = make_factors(FEATURES, gaussian=True)["s"].outputs[-1]
+    assert output.size == 6
+    prediction = torch.tensor([0.0, 1.0, 2.0, 0.0, torch.tensor(3.0).log(), 0.0])
+    mean, scale = statistics.denormalise("s", output, prediction)
     torch.testing.assert_close(mean, torch.tensor([1.0, -10.0, 7.0]))
     torch.testing.assert_close(scale, torch.tensor([0.5, 30.0, 1.0]))
 

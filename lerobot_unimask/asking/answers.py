@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import Component, Factor
+from lerobot_unimask.data.factors import Component, Factor, Output
 from lerobot_unimask.data.window import Statistics, Window
 from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.networks.layers import Cache, Predictions
@@ -32,16 +32,20 @@ class Model(Protocol):
 
 @dataclass
 class DiscreteDistribution:
-    """The answer about one discrete component at every step.
+    """The answer about discrete components at every step: one, or several of a token together.
 
     Where the token was shown: the shown value, with certainty. Where it was neither shown nor asked: NaN.
 
     Attributes:
-        probabilities: (B, K, categories)
+        probabilities: (B, K, C), of the component's categories, or of all combinations of the components'.
     """
 
-    component: Component
+    output: Output
     probabilities: Tensor
+
+    @property
+    def component(self) -> Component:
+        return self.output.components[0]
 
     @property
     def name(self) -> str:
@@ -49,21 +53,34 @@ class DiscreteDistribution:
 
     @property
     def most_likely(self) -> Tensor:
-        """(B, K, 1): the category of the highest probability."""
-        best = self.probabilities.nan_to_num(-1.0).argmax(-1, keepdim=True).to(self.probabilities.dtype)
+        """(B, K, d): the categories of the highest probability."""
+        best = self.output.split(self.probabilities.nan_to_num(-1.0).argmax(-1)).to(self.probabilities.dtype)
         return torch.where(self.probabilities.isnan().any(-1, keepdim=True), torch.nan, best)
 
+    def marginals(self) -> "list[DiscreteDistribution]":
+        """One for each component."""
+        if len(self.output.components) == 1:
+            return [self]
+        table = self.probabilities.unflatten(-1, self.output.categories)
+        axes = range(-len(self.output.categories), 0)
+        parts = [table.sum([other for other in axes if other != axis]) for axis in axes]
+        return [DiscreteDistribution(*pair) for pair in zip(self.output.apart, parts, strict=True)]
+
+    def probability(self, values: Tensor) -> Tensor:
+        """That of the values of tokens, (B, K, D) -> (B, K)."""
+        return self.probabilities.gather(-1, self.output.combination(values).unsqueeze(-1)).squeeze(-1)
+
     def at(self, rows: Tensor, step: int) -> "DiscreteDistribution":
-        """That of some windows, (n,) their numbers, at one step: (n, 1, categories)."""
-        return DiscreteDistribution(self.component, self.probabilities[rows, step : step + 1])
+        """That of some windows, (n,) their numbers, at one step: (n, 1, C)."""
+        return DiscreteDistribution(self.output, self.probabilities[rows, step : step + 1])
 
     def draw(self, generator: torch.Generator | None) -> Tensor:
-        """One sample for each step, (B, K, 1)."""
+        """One sample for each step, (B, K, d)."""
         certain = torch.zeros_like(self.probabilities)
         certain[..., 0] = 1.0  # where nothing was asked, anything may be drawn, but something must
         weights = torch.where(self.probabilities.isnan(), certain, self.probabilities)
         drawn = torch.multinomial(weights.flatten(0, 1), 1, generator=generator)
-        return drawn.view(*self.probabilities.shape[:2], 1).to(self.probabilities.dtype)
+        return self.output.split(drawn.view(self.probabilities.shape[:2])).to(self.probabilities.dtype)
 
 
 @dataclass
@@ -75,9 +92,13 @@ class ContinuousDistribution:
         scale: (B, K, d), standard deviation: 0 where shown; None from an L2 head, which has none.
     """
 
-    component: Component
+    output: Output
     mean: Tensor
     scale: Tensor | None
+
+    @property
+    def component(self) -> Component:
+        return self.output.components[0]
 
     @property
     def name(self) -> str:
@@ -88,10 +109,14 @@ class ContinuousDistribution:
         """(B, K, d): the mean."""
         return self.mean
 
+    def marginals(self) -> "list[ContinuousDistribution]":
+        """One for each component."""
+        return [self]
+
     def at(self, rows: Tensor, step: int) -> "ContinuousDistribution":
         """That of some windows, (n,) their numbers, at one step: (n, 1, d)."""
         scale = None if self.scale is None else self.scale[rows, step : step + 1]
-        return ContinuousDistribution(self.component, self.mean[rows, step : step + 1], scale)
+        return ContinuousDistribution(self.output, self.mean[rows, step : step + 1], scale)
 
     def draw(self, generator: torch.Generator | None) -> Tensor:
         """One sample for each step, (B, K, d); an L2 head's is its mean."""
@@ -106,22 +131,40 @@ Distribution = DiscreteDistribution | ContinuousDistribution
 
 @dataclass
 class Answer:
-    """What a policy answers to one mask: `answer["a"][0].probabilities` is (B, K, categories)."""
+    """What a policy answers to one mask: `answer["a"][0].probabilities` is (B, K, categories).
+
+    Attributes:
+        distributions: factor -> one distribution for each of its outputs, of the output's components together.
+    """
 
     mask: Mask
     distributions: dict[str, list[Distribution]]
 
     def __getitem__(self, factor: str) -> list[Distribution]:
-        """One distribution for each component of `s` or `a`, in the order in which the dataset stores them."""
-        return self.distributions[factor]
+        """One distribution for each component of `s` or `a`, its marginal, in the order in which the dataset stores
+        them."""
+        parts = [part for distribution in self.distributions[factor] for part in distribution.marginals()]
+        return sorted(parts, key=lambda part: part.component.dims.start)
 
     def most_likely(self, factor: str) -> Tensor:
         """(B, K, D): shown values as they are, the most likely ones where asked, NaN elsewhere."""
-        return torch.cat([distribution.most_likely for distribution in self.distributions[factor]], dim=-1)
+        return self._tokens(factor, [distribution.most_likely for distribution in self.distributions[factor]])
 
     def draw(self, factor: str, generator: torch.Generator | None) -> Tensor:
-        """(B, K, D): one sample for each step, each component's from its own distribution."""
-        return torch.cat([distribution.draw(generator) for distribution in self.distributions[factor]], dim=-1)
+        """(B, K, D): one sample for each step."""
+        return self._tokens(factor, [distribution.draw(generator) for distribution in self.distributions[factor]])
+
+    def draw_at(self, factor: str, rows: Tensor, step: int, generator: torch.Generator | None) -> Tensor:
+        """One sample for one step of some windows, (n,) their numbers: (n, D)."""
+        here = [distribution.at(rows, step) for distribution in self.distributions[factor]]
+        return self._tokens(factor, [distribution.draw(generator) for distribution in here])[:, 0]
+
+    def _tokens(self, factor: str, parts: list[Tensor]) -> Tensor:
+        """The outputs' values, (B, K, d) each, as tokens, (B, K, D)."""
+        if len(parts) == 1:
+            return parts[0]
+        numbers = [number for distribution in self.distributions[factor] for number in distribution.output.numbers]
+        return torch.cat(parts, dim=-1)[..., sorted(range(len(numbers)), key=numbers.__getitem__)]
 
 
 def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None) -> Answer:
@@ -133,23 +176,22 @@ def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None)
     """
     predictions = model.predict(model.statistics.normalise(window), mask, cache)
     distributions: dict[str, list[Distribution]] = {}
-    for name, outputs in predictions.items():
+    for name in predictions:
         shown = mask.shown[name].unsqueeze(-1)
         known = shown | mask.asked[name].unsqueeze(-1)  # (B, K, 1)
         distributions[name] = []
-        for output, component in zip(outputs, model.factors[name].components, strict=True):
-            output = output.float()  # also under autocast, or probabilities would not sum to one
-            value = window.values[name][..., component.dims]
-            if component.discrete:
-                certain = torch.where(shown, value, 0.0).squeeze(-1).long()
-                certain = functional.one_hot(certain, component.categories).to(output.dtype)
-                probabilities = torch.where(shown, certain, output.softmax(-1))
+        for prediction, output in zip(predictions[name], model.factors[name].outputs, strict=True):
+            prediction = prediction.float()  # also under autocast, or probabilities would not sum to one
+            if output.discrete:
+                certain = output.combination(torch.where(shown, window.values[name], 0.0))
+                certain = functional.one_hot(certain, output.size).to(prediction.dtype)
+                probabilities = torch.where(shown, certain, prediction.softmax(-1))
                 probabilities = torch.where(known, probabilities, torch.nan)
-                distributions[name].append(DiscreteDistribution(component, probabilities))
+                distributions[name].append(DiscreteDistribution(output, probabilities))
             else:
-                mean, scale = model.statistics.denormalise(name, component, output)
-                mean = torch.where(known, torch.where(shown, value, mean), torch.nan)
+                mean, scale = model.statistics.denormalise(name, output, prediction)
+                mean = torch.where(known, torch.where(shown, window.values[name][..., output.numbers], mean), torch.nan)
                 if scale is not None:
                     scale = torch.where(known, torch.where(shown, 0.0, scale), torch.nan)
-                distributions[name].append(ContinuousDistribution(component, mean, scale))
+                distributions[name].append(ContinuousDistribution(output, mean, scale))
     return Answer(mask, distributions)

@@ -55,9 +55,9 @@ def sample(
 ) -> Samples:
     """Draw the asked-for tokens one after another, each given the shown ones and those already drawn (chain rule).
 
-    A token's own components (agent and key, say) are drawn side by side from their marginals. With a check, a token
-    that contradicts what is shown or already drawn is drawn again (the paper's repair of backward inference, appendix
-    "Fixing prediction inconsistencies"), and a sample in a dead end starts over.
+    A token's own numbers (agent and key, say) are drawn together where the model predicts them so, otherwise side by
+    side. With a check, a token that contradicts what is shown or already drawn is drawn again (the paper's repair of
+    backward inference, appendix "Fixing prediction inconsistencies"), and a sample in a dead end starts over.
 
     Note: Rejection looks at what is decided so far and not ahead, so the accepted samples are not quite distributed as
         all samples that happen to pass are.
@@ -105,8 +105,7 @@ def sample(
             shown = shown | {name: shown[name] | here}
             redraw = here[:, step].nonzero().squeeze(-1)
             for _ in range(tries):
-                value = torch.cat([distribution.at(redraw, step).draw(generator) for distribution in said[name]], -1)
-                values[name][redraw, step] = value[:, 0]
+                values[name][redraw, step] = said.draw_at(name, redraw, step, generator)
                 samples.drawn += len(redraw)
                 redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(shown, redraw))]
                 samples.rejected += len(redraw)

@@ -1,13 +1,16 @@
 """A dataset's columns -> the factors of the mask language: `s`, `a`, `rtg`, the properties and the cameras."""
 
 import logging
+import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
 from lerobot.configs import PolicyFeature
 from lerobot.utils.constants import OBS_PREFIX
+from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
@@ -19,6 +22,7 @@ RETURN_SO_FAR = "observation.return_so_far"
 TASK = "task"  # LeRobot's name for what an episode is to do, a text; here the factor that it becomes, too
 
 MAX_SIZE = 65536  # numbers of a column, categories of a number: more is a damaged file
+MAX_JOINT = 1024  # combinations of categories that one distribution is over; beyond, each number has its own
 LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
 
 
@@ -57,13 +61,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class Component:
-    """What one output head predicts: a single discrete dimension of a factor, or a run of continuous ones."""
+    """A single discrete number of a factor, or a run of continuous ones."""
 
     name: str
     dims: slice  # of the factor's D
     categories: int | None  # None: continuous
     computed: bool = False  # by this package, not stored in the dataset or given by a user
-    gaussian: bool = False  # continuous, predicted as a mean and a scale
     names: tuple[str, ...] = ()  # of its numbers
     labels: tuple[str, ...] = ()  # of its categories, where they are texts
 
@@ -71,19 +74,69 @@ class Component:
     def discrete(self) -> bool:
         return self.categories is not None
 
+
+@dataclass(frozen=True)
+class Output:
+    """What a network predicts of a token in one piece: discrete components together, as one distribution over all
+    combinations of their categories, or a continuous one."""
+
+    components: tuple[Component, ...]
+    gaussian: bool = False  # continuous, predicted as a mean and a scale
+
+    @property
+    def discrete(self) -> bool:
+        return self.components[0].discrete
+
+    @property
+    def apart(self) -> "list[Output]":
+        """Each of its components as an output."""
+        return [replace(self, components=(component,)) for component in self.components]
+
+    @property
+    def numbers(self) -> list[int]:
+        """Which of the factor's D numbers it is about."""
+        return [number for component in self.components for number in range(component.dims.start, component.dims.stop)]
+
+    @property
+    def categories(self) -> tuple[int, ...]:
+        """Of each discrete component."""
+        return tuple(component.categories for component in self.components if component.categories is not None)
+
     @property
     def size(self) -> int:
-        """What a head puts out for it: logits; a mean for each dimension; or means, then the logarithms of scales."""
-        width = self.dims.stop - self.dims.start
-        return self.categories if self.discrete else 2 * width if self.gaussian else width
+        """Of a prediction: logits of the combinations; or a mean for each number, then logarithms of the scales."""
+        if self.discrete:
+            return math.prod(self.categories)
+        return (1 + self.gaussian) * len(self.numbers)
+
+    def combination(self, values: Tensor) -> Tensor:
+        """The discrete values of tokens, (..., D), as numbers of combinations, (...); the last category runs first."""
+        number = torch.zeros(values.shape[:-1], dtype=torch.int64, device=values.device)
+        for component, count in zip(self.components, self.categories, strict=True):
+            number = number * count + values[..., component.dims.start].long()
+        return number
+
+    def split(self, combination: Tensor) -> Tensor:
+        """Numbers of combinations, (...), as the categories of each component, (..., d)."""
+        parts = []
+        for count in reversed(self.categories):
+            parts.append(combination % count)
+            combination = combination // count
+        return torch.stack(parts[::-1], dim=-1)
 
 
 @dataclass(frozen=True)
 class Factor:
-    """What the mask language calls `s`, `a`, `rtg` or by a property's name."""
+    """What the mask language calls `s`, `a`, `rtg` or by a property's name.
+
+    Attributes:
+        components: its numbers, in the dataset's order.
+        outputs: how they are predicted.
+    """
 
     name: str
     components: tuple[Component, ...]
+    outputs: tuple[Output, ...]
 
     @property
     def size(self) -> int:
@@ -96,10 +149,14 @@ class Factor:
         return max(component.dims.stop for component in self.components if not component.computed)
 
 
-def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = False) -> dict[str, Factor]:
+def make_factors(
+    features: Mapping[str, Sequence[Feature]], *, joint: bool = False, gaussian: bool = False
+) -> dict[str, Factor]:
     """The model's factors from the features that its config stores under each name.
 
     Args:
+        joint: predict a token's discrete components as one distribution, where it is over at most `MAX_JOINT`
+            combinations; otherwise each by itself.
         gaussian: predict continuous components as a mean and a scale.
     """
     factors = {}
@@ -110,7 +167,7 @@ def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = 
             if feature.categories is None:
                 label = feature.key.removeprefix("observation.")
                 dims = slice(start, start + feature.size)
-                components.append(Component(label, dims, None, gaussian=gaussian, names=names_of(feature)))
+                components.append(Component(label, dims, None, names=names_of(feature)))
             else:
                 for i, (label, count) in enumerate(zip(names_of(feature), feature.categories, strict=True)):
                     dims, labels = slice(start + i, start + i + 1), tuple(feature.labels or ())
@@ -118,8 +175,18 @@ def make_factors(features: Mapping[str, Sequence[Feature]], *, gaussian: bool = 
             start += feature.size
         if name == "rtg":  # the token is the pair (return-to-go, timestep / horizon)
             components.append(Component("timestep", slice(start, start + 1), None, computed=True))
-        factors[name] = Factor(name, tuple(components))
+        factors[name] = Factor(name, tuple(components), _outputs(components, joint=joint, gaussian=gaussian))
     return factors
+
+
+def _outputs(components: Sequence[Component], *, joint: bool, gaussian: bool) -> tuple[Output, ...]:
+    discrete = tuple(component for component in components if component.discrete)
+    together = joint and len(discrete) > 1 and math.prod(c.categories or 1 for c in discrete) <= MAX_JOINT
+    outputs = [Output(discrete)] if together else []
+    for component in components:
+        if not (together and component.discrete):
+            outputs.append(Output((component,), gaussian=gaussian and not component.discrete))
+    return tuple(outputs)
 
 
 def names_of(feature: Feature) -> tuple[str, ...]:

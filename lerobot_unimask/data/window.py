@@ -18,9 +18,9 @@ from lerobot_unimask.data.factors import (
     LOG_SCALE,
     STATE,
     Camera,
-    Component,
     Factor,
     Feature,
+    Output,
     category_numbers,
     names_of,
 )
@@ -294,13 +294,13 @@ class Statistics(nn.Module):
         }
         return Window(window.values | values, window.valid)  # pictures as they are
 
-    def denormalise(self, name: str, component: Component, output: Tensor) -> tuple[Tensor, Tensor | None]:
-        """A network's output for one continuous component, (..., size), as mean and scale in the dataset's units, each
-        (..., d); the scale is None where the head predicts none."""
-        mean, std = self.get_buffer(f"{name}_mean")[component.dims], self.get_buffer(f"{name}_std")[component.dims]
-        if not component.gaussian:
-            return output * std + mean, None
-        normalised_mean, log_scale = output.chunk(2, dim=-1)
+    def denormalise(self, name: str, output: Output, prediction: Tensor) -> tuple[Tensor, Tensor | None]:
+        """A prediction of one continuous output, (..., size), as mean and scale in the dataset's units, each (..., d);
+        the scale is None where the head predicts none."""
+        mean, std = (self.get_buffer(f"{name}_{part}")[output.numbers] for part in ("mean", "std"))
+        if not output.gaussian:
+            return prediction * std + mean, None
+        normalised_mean, log_scale = prediction.chunk(2, dim=-1)
         return normalised_mean * std + mean, log_scale.clamp(*LOG_SCALE).exp() * std
 
 

@@ -4,16 +4,17 @@ Legend of shapes: B windows, K steps, N tokens, D the numbers of a factor, W wid
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import Factor
+from lerobot_unimask.data.factors import Factor, Output
 from lerobot_unimask.language.masks import ASKABLE
 
-Predictions = dict[str, list[Tensor]]  # factor -> one (B, K, size) for each of its components
+Predictions = dict[str, list[Tensor]]  # factor -> one (B, K, size) for each of its outputs
 
 
 class NumberEncoding(nn.Module):
@@ -151,7 +152,7 @@ class Heads(nn.ModuleDict):
     """
 
     def __init__(self, factors: dict[str, Factor], width: int, *, steps: int = 1):
-        sizes = {name: [component.size for component in factors[name].components] for name in ASKABLE}
+        sizes = {name: [output.size for output in factors[name].outputs] for name in ASKABLE}
         super().__init__({name: nn.Linear(width, steps * sum(of_factor)) for name, of_factor in sizes.items()})
         self.sizes = sizes
         self.steps = steps
@@ -172,6 +173,28 @@ class Heads(nn.ModuleDict):
             name: list(output.unflatten(-1, (self.steps, -1)).flatten(1, 2).split(self.sizes[name], dim=-1))
             for name, output in outputs.items()
         }
+
+
+def by_component(predictions: Predictions, factors: Mapping[str, Factor]) -> Predictions:
+    """The marginals of predictions: factor -> one (B, K, size) for each of its components."""
+    apart: Predictions = {}
+    for name, wholes in predictions.items():
+        parts = {
+            component.dims.start: part
+            for whole, output in zip(wholes, factors[name].outputs, strict=True)
+            for part, component in zip(marginals(whole, output), output.components, strict=True)
+        }
+        apart[name] = [parts[component.dims.start] for component in factors[name].components]
+    return apart
+
+
+def marginals(prediction: Tensor, output: Output) -> list[Tensor]:
+    """A prediction, (..., size), of each of its components without the others: log-odds, (..., categories) each."""
+    if len(output.components) == 1:
+        return [prediction]
+    table = prediction.unflatten(-1, output.categories)
+    axes = range(-len(output.categories), 0)
+    return [table.logsumexp([other for other in axes if other != axis]) for axis in axes]
 
 
 @dataclass

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import LOG_SCALE, Component, Factor
+from lerobot_unimask.data.factors import LOG_SCALE, Factor, Output
 from lerobot_unimask.data.window import Window
+from lerobot_unimask.networks.layers import Predictions, marginals
 
 
 class LossParts(MutableMapping[str, Any]):
@@ -42,19 +43,19 @@ class LossParts(MutableMapping[str, Any]):
         return len(self._parts)
 
 
-def component_loss(prediction: Tensor, value: Tensor, component: Component) -> Tensor:
-    """What one component costs at every step, (B, K): cross-entropy in nats; or, averaged over its dimensions and in
-    units of their standard deviations, the squared error or a Gaussian's negative log-likelihood in nats.
+def output_loss(prediction: Tensor, value: Tensor, output: Output) -> Tensor:
+    """What one output costs at every step, (B, K): cross-entropy in nats; or, averaged over its numbers and in units of
+    their standard deviations, the squared error or a Gaussian's negative log-likelihood in nats.
 
     Note: A Gaussian's gradient is that of the negative log-likelihood times the predicted scale (Seitzer et al., "On
         the pitfalls of heteroscedastic uncertainty estimation", 2022, beta = 1/2). Without it, what is predicted to
         within a fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model that learns
         where the mass goes is slow to learn what moves it (docs/experiments.md).
     """
-    target = value[..., component.dims]
-    if component.discrete:
-        return functional.cross_entropy(prediction.transpose(1, 2), target.squeeze(-1).long(), reduction="none")
-    if component.gaussian:
+    if output.discrete:
+        return functional.cross_entropy(prediction.transpose(1, 2), output.combination(value), reduction="none")
+    target = value[..., output.numbers]
+    if output.gaussian:
         mean, log_scale = prediction.chunk(2, dim=-1)
         log_scale = log_scale.clamp(*LOG_SCALE)
         surprise = (target - mean) * (-log_scale).exp()
@@ -79,21 +80,23 @@ def token_count(asked: Tensor) -> Tensor:
 
 
 def masked_losses(
-    predictions: dict[str, list[Tensor]],
+    predictions: Predictions,
     window: Window,
     asked: dict[str, Tensor],
     factors: dict[str, Factor],
     *,
     reduction: str = "mean",
+    apart: bool = False,
 ) -> dict[str, Tensor]:
-    """Each factor's loss: its components' mean losses over the asked-for tokens of the batch, added up. With several
+    """Each factor's loss: its outputs' mean losses over the asked-for tokens of the batch, added up. With several
     processes it is this process's part in the mean over all their tokens, see `token_count`.
 
     Args:
-        predictions: factor -> one (B, K, size) per component, as a network puts them out.
+        predictions: factor -> one (B, K, size) per output, as a network puts them out.
         window: the recorded values, normalised.
         asked: factor -> (B, K) bool, True = asked for; never a step outside the episode.
         reduction: "mean"; or "none", each window's part, whose mean over the windows is that mean.
+        apart: whether the components of a token count one by one, by their marginals, as the paper's do.
 
     Returns:
         factor -> scalar, or (B,); 0 where nothing of the factor is asked.
@@ -109,10 +112,12 @@ def masked_losses(
         # Replaced where not asked: past the end of an episode anything may stand, even no number at all.
         value = torch.where(here.unsqueeze(-1), window.values[name], 0.0)
         count = token_count(here)
-        costs = (
-            component_loss(output, value, component) * here  # (B, K)
-            for output, component in zip(outputs, factors[name].components, strict=True)
-        )
+        pairs = list(zip(outputs, factors[name].outputs, strict=True))
+        if apart:
+            pairs = [
+                pair for whole, output in pairs for pair in zip(marginals(whole, output), output.apart, strict=True)
+            ]
+        costs = (output_loss(prediction, value, output) * here for prediction, output in pairs)  # each (B, K)
         if reduction == "none":
             losses[name] = sum(cost.sum(1) * (len(here) / count) for cost in costs)
         else:

@@ -76,8 +76,8 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.on_course = {
-            i: c.dims for i, c in enumerate(factors["s"].components) if residuals and not c.discrete
-        }  # which of the states' components, and their dimensions
+            i: output.numbers for i, output in enumerate(factors["s"].outputs) if residuals and not output.discrete
+        }  # which of the states' outputs, and their numbers
         self.heads = Heads(factors, width)
         self.cameras = nn.ModuleDict(
             {name: CameraEmbedding(camera.shape, width, **(backbone or {})) for name, camera in cameras.items()}
@@ -91,7 +91,7 @@ class Transformer(nn.Module):
         cache: Cache | None = None,
         asked: dict[str, Tensor] | None = None,
     ) -> Predictions:
-        """For every step, logits of discrete components, and of continuous ones normalised means, or means and the
+        """For every step, logits of discrete outputs, and of continuous ones normalised means, or means and the
         logarithms of scales.
 
         Args:
@@ -120,10 +120,9 @@ class Transformer(nn.Module):
         if self.on_course:
             states = torch.where(shown["s"].unsqueeze(-1), window.values["s"], 0.0)
             ahead = course(states, shown["s"], causal)
-            for i, dims in self.on_course.items():
-                output = predictions["s"][i]
-                mean = output[..., : dims.stop - dims.start] + ahead[..., dims]
-                predictions["s"][i] = torch.cat([mean, output[..., dims.stop - dims.start :]], dim=-1)
+            for i, numbers in self.on_course.items():
+                mean, scale = predictions["s"][i].tensor_split([len(numbers)], dim=-1)
+                predictions["s"][i] = torch.cat([mean + ahead[..., numbers], scale], dim=-1)
         return predictions
 
     def _predict_asked(self, x: Tensor, causal: Tensor | bool, asked: dict[str, Tensor]) -> Predictions:

@@ -25,10 +25,11 @@ from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.episodes import first_windows, open_dataset
 from lerobot_unimask.data.window import make_window
-from lerobot_unimask.envs.doorkey.optimum import FEATURES, Optimum, entropies, mean_over_asked
+from lerobot_unimask.envs.doorkey.optimum import FACTORS, FEATURES, Optimum, entropies, mean_over_asked
 from lerobot_unimask.envs.doorkey.rules import FPS, HORIZON
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
+from lerobot_unimask.networks.layers import by_component
 from lerobot_unimask.paper.early_stopping import train_to_lowest
 from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, run_study, write_results
 from lerobot_unimask.plots.heatmaps import Panel, heatmaps
@@ -178,7 +179,7 @@ def optimum_losses(config: HeatmapConfig) -> dict[str, float]:
     losses = {}
     for task in TASKS:
         mask = TrainingMasks(task, tuple(FEATURES), K)(window.valid, batch["index"], seed=0, step=VALIDATION_STEP)
-        losses[task] = mean_over_asked(entropies(optimum.predict(window, mask)), mask.asked)
+        losses[task] = mean_over_asked(entropies(by_component(optimum.predict(window, mask), FACTORS)), mask.asked)
     return losses
 
 

@@ -38,7 +38,7 @@ RARE, COMMON = 0.01, 0.10  # probabilities of the final states that are asked fo
 
 RETURNS = range(7)
 
-# Drawn in every order. An action is one component, so its chain rule is exact; a state's two are drawn side by side.
+# Drawn in every order. An action is one number; a state's two are drawn together where they are predicted so.
 ACTIONS_QUESTION, HISTORY_QUESTION = "a[:] | s[0]", "s[1:], a[:] | s[0]"
 
 

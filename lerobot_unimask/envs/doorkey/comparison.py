@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lerobot_unimask.envs.doorkey.expert import Expert
 from lerobot_unimask.envs.doorkey.optimum import (
+    FACTORS,
     Optimum,
     check_features,
     divergences,
@@ -17,6 +18,7 @@ from lerobot_unimask.envs.doorkey.optimum import (
 from lerobot_unimask.language.masks import RANDOM_MASK
 from lerobot_unimask.language.training_masks import validation_masks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
+from lerobot_unimask.networks.layers import by_component
 from lerobot_unimask.networks.losses import masked_losses
 
 
@@ -44,12 +46,13 @@ def beside_optimum(
     for text in masks:
         mask = validation_masks(text, tuple(policies[0].factors), window.valid, index)
         exact = optimum.predict(window, mask)
-        parts = masked_losses(exact, window, mask.asked, policies[0].factors)
+        marginals = by_component(exact, FACTORS)
+        parts = masked_losses(exact, window, mask.asked, FACTORS, apart=True)
         record["losses"][text] = sum(part.item() for part in parts.values())
-        record["expected_losses"][text] = mean_over_asked(entropies(exact), mask.asked)
+        record["expected_losses"][text] = mean_over_asked(entropies(marginals), mask.asked)
         for policy, values, distance in zip(policies, normalised, distances, strict=True):
-            predictions = policy.predict(values, mask)
-            distance["divergence"][text] = mean_over_asked(divergences(exact, predictions), mask.asked)
+            predictions = by_component(policy.predict(values, mask), policy.factors)
+            distance["divergence"][text] = mean_over_asked(divergences(marginals, predictions), mask.asked)
     if RANDOM_MASK in masks:
         for policy, values, distance in zip(policies, normalised, distances, strict=True):
             distance["random_mask_divergence"] = random_mask_divergence(optimum, policy, window, values, index)

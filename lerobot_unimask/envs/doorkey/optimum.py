@@ -28,7 +28,7 @@ from lerobot_unimask.envs.doorkey.expert import Expert, expert_probabilities
 from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, HORIZON, START_PAIRS, distance_to_goal, step
 from lerobot_unimask.language.masks import RANDOM_MASK, Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
-from lerobot_unimask.networks.layers import Cache, Predictions
+from lerobot_unimask.networks.layers import Cache, Predictions, by_component
 
 FEATURES = {
     "s": [Feature(STATE, 2, [len(CELLS), len(CELLS)], ["agent_cell", "key_cell"])],
@@ -38,7 +38,7 @@ FEATURES = {
 
 SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # edges of the bins of how much a random mask hides
 
-FACTORS = make_factors(FEATURES)
+FACTORS = make_factors(FEATURES, joint=True)
 
 _CHUNK = 2048  # windows at a time: half a gigabyte
 
@@ -77,7 +77,8 @@ class Optimum:
             self.start = self._advance(self.start[:, None] * self.policy)
 
     def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
-        """For every step logarithms of probabilities, float64, of the agent's cell, the key's cell and the action.
+        """For every step logarithms of probabilities, float64, of the state, the agent's and the key's cell together,
+        and of the action.
 
         Args:
             window: in the dataset's units, where a policy's `predict` takes normalised values.
@@ -91,20 +92,18 @@ class Optimum:
         device = window.valid.device
         values = {name: value.cpu() for name, value in window.values.items()}
         shown = {name: tokens.cpu() for name, tokens in mask.shown.items()}
-        parts = []
+        parts: list[tuple[Tensor, Tensor]] = []
         for first in range(0, B, _CHUNK):
             chunk = slice(first, first + _CHUNK)
             these, seen = ({name: tensor[chunk] for name, tensor in part.items()} for part in (values, shown))
             parts.append(self._marginals(these, seen, K, first))
-        agent, key, action = (
-            torch.cat(part).log().clamp_min(_LOG_ZERO).to(device) for part in zip(*parts, strict=True)
-        )
-        return {"s": [agent, key], "a": [action]}
+        state, action = (torch.cat(part).log().clamp_min(_LOG_ZERO).to(device) for part in zip(*parts, strict=True))
+        return {"s": [state], "a": [action]}
 
     def _marginals(
         self, values: dict[str, Tensor], shown: dict[str, Tensor], K: int, first_window: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Probabilities of the agent's cell (B, K, 16), the key's cell (B, K, 16) and the action (B, K, 4)."""
+    ) -> tuple[Tensor, Tensor]:
+        """Probabilities of the agent's and the key's cell together, (B, K, 256), and of the action, (B, K, 4)."""
         steps = HORIZON - self.first_step  # to the end of the episode; what follows the window is not seen
         seen_state, seen_action = self._evidence(values, shown, K, steps)  # (B, T, S), (B, T, A)
         first, last = self._return_evidence(values, shown)  # (1, C, S), (B, C, S)
@@ -117,7 +116,8 @@ class Optimum:
         ahead.reverse()
 
         # Forward: past (B, C, S), the probability of all that is seen up to this step's state, and of the state.
-        agent, key = torch.full((2, B, K, len(CELLS)), 1 / len(CELLS), dtype=torch.float64)
+        cells = FACTORS["s"].outputs[0]
+        state = torch.full((B, K, cells.size), 1 / cells.size, dtype=torch.float64)
         action = torch.full((B, K, len(ACTIONS)), 1 / len(ACTIONS), dtype=torch.float64)  # past the episode's end
         past = self.start * first * seen_state[:, 0, None]
         for k in range(min(K, steps)):
@@ -130,14 +130,12 @@ class Optimum:
                     f"step {self.first_step} on: its probability is zero."
                 )
             joint = joint / total[:, None, None]
-            state = joint.sum(-1)  # (B, S)
-            agent[:, k] = torch.zeros(B, len(CELLS), dtype=torch.float64).index_add_(1, self.seen[:, 0], state)
-            key[:, k] = torch.zeros(B, len(CELLS), dtype=torch.float64).index_add_(1, self.seen[:, 1], state)
+            state[:, k] = torch.zeros_like(state[:, k]).index_add_(1, cells.combination(self.seen), joint.sum(-1))
             action[:, k] = joint.sum(1)
             if k + 1 < steps:
                 moves = past.unsqueeze(-1) * self.policy * seen_action[:, k, None, None]
                 past = self._advance(moves) * seen_state[:, k + 1, None]
-        return agent, key, action
+        return state, action
 
     def _evidence(
         self, values: dict[str, Tensor], shown: dict[str, Tensor], K: int, steps: int
@@ -208,7 +206,7 @@ def divergences(exact: Predictions, predictions: Predictions) -> dict[str, list[
     """Kullback-Leibler divergence from the exact marginal to the model's, for each component at every step.
 
     Args:
-        exact, predictions: factor -> logits, one (B, K, categories) for each component.
+        exact, predictions: marginals, see `by_component`: factor -> logits, one (B, K, categories) for each component.
 
     Returns:
         factor -> one (B, K) float64 for each component, in nats; 0 where the two agree.
@@ -220,7 +218,8 @@ def divergences(exact: Predictions, predictions: Predictions) -> dict[str, list[
 
 
 def entropies(exact: Predictions) -> dict[str, list[Tensor]]:
-    """The loss that no model can beat in expectation, for each component at every step: (B, K) float64, in nats."""
+    """The loss that no model can beat in expectation, by marginals, for each component at every step: (B, K) float64,
+    in nats."""
     return {name: [_cross_entropy(p, p) for p in parts] for name, parts in exact.items()}
 
 
@@ -249,7 +248,8 @@ def random_mask_divergence(
     shares: dict[str, list[Tensor]] = {label: [] for _, _, label in kinds}
     for number in range(draws):
         mask = draw(window.valid, index, seed=0, step=VALIDATION_STEP - number)
-        apart = divergences(optimum.predict(window, mask), model.predict(normalised, mask))
+        exact = by_component(optimum.predict(window, mask), FACTORS)
+        apart = divergences(exact, by_component(model.predict(normalised, mask), model.factors))
         hidden = torch.cat([mask.asked["s"], mask.asked["a"]], dim=1).double().mean(1)  # (B,)
         for name, i, label in kinds:
             found[label].append(apart[name][i][mask.asked[name]])

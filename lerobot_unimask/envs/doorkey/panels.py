@@ -133,8 +133,8 @@ def did_as_asked(achieved: Mapping[str, Sequence[float]], given: Given) -> np.nd
 def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0) -> Panel:
     """Sample possible histories of a final state from the end to the start: a[K-2], s[K-2], a[K-3], ..., s[0].
 
-    Note: A state's two cells are drawn side by side, so some tokens contradict the environment; as in the paper, they
-        are drawn again. A model that has hardly learnt anything seldom draws others: of it there may be no history.
+    Note: No model is exact, so some tokens contradict the environment; as in the paper, they are drawn again. A model
+        that has hardly learnt anything seldom draws others: of it there may be no history.
 
     Args:
         histories: How many.
