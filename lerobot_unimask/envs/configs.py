@@ -7,7 +7,7 @@ One environment is one `EnvConfig` of a few lines: its `task`, which with the pa
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -63,7 +63,9 @@ class DoorKeyEnvConfig(UniMASKEnvConfig):
     """`--env.type=doorkey`"""
 
     task: str | None = "DoorKey-v0"
+    """Name of the environment."""
     fps: int = 10
+    """Steps a second."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=2, action=1))
 
 
@@ -73,9 +75,12 @@ class Maze2DEnvConfig(UniMASKEnvConfig):
     """`--env.type=maze2d`"""
 
     task: str | None = "Maze2D-v0"
+    """Name of the environment."""
     fps: int = 100
+    """Steps a second."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=4, action=2))
-    maze: str = "medium"  # umaze, medium, large, or a maze's text (see `envs/maze2d.py`)
+    maze: str = "medium"
+    """Maze: umaze, medium, large, or its text, a line for each row (see `envs/maze2d/maze.py`)."""
 
     @property
     def gym_kwargs(self) -> Mapping[str, Any]:
@@ -124,8 +129,11 @@ class GymnasiumEnvConfig(UniMASKEnvConfig):
     """
 
     task: str | None = None
-    package: str | None = None  # whose import registers the environment, such as gym_pusht
+    """gymnasium id of the environment."""
+    package: str | None = None
+    """Package whose import registers the environment, such as gym_pusht."""
     fps: int = 30
+    """Steps a second."""
 
     def __post_init__(self) -> None:
         if self.task is None:
@@ -135,14 +143,18 @@ class GymnasiumEnvConfig(UniMASKEnvConfig):
         env = self._make()
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ValueError(f"{self.task} takes {env.action_space}; --env.type=gymnasium takes continuous actions.")
-        own = {name: space for name, space in env.observation_space.spaces.items() if len(space.shape or ()) == 1}
+        own = {
+            name: space
+            for name, space in cast(gym.spaces.Dict, env.observation_space).spaces.items()
+            if len(space.shape or ()) == 1
+        }
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, env.action_space.shape)}
         self.features |= {name: PolicyFeature(FeatureType.STATE, space.shape) for name, space in own.items()}
         self.features_map |= {name: f"observation.{name}" for name in own if name not in self.features_map}
         env.close()
 
     def _make(self) -> gym.Env:
-        return ReportReturn(gym.make(self.task, disable_env_checker=True, **self.gym_kwargs))
+        return ReportReturn(gym.make(str(self.task), disable_env_checker=True, **self.gym_kwargs))
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """As the other environments'."""

@@ -256,7 +256,7 @@ def _select(
                         text,
                         part.position,
                     )
-                steps = (step % K,)
+                steps = range(step % K, step % K + 1)
             if own not in (*ASKABLE, *cameras) and any(steps):
                 raise MaskError(
                     f"{term.factor} can be shown at step 0 only: write {term.factor}[0].", text, term.position
