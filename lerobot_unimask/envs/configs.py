@@ -13,8 +13,10 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from lerobot_unimask.envs.cameras import check_obs_type
+from lerobot_unimask.envs.maze2d.maze import CAMERA_PIXELS_PER_CELL, parse_maze
 from lerobot_unimask.envs.returns import ReportReturn
 
 
@@ -48,6 +50,11 @@ class UniMASKEnvConfig(EnvConfig):
     def gym_kwargs(self) -> Mapping[str, Any]:
         return {"render_mode": "rgb_array"}
 
+    def add_camera(self, height: int, width: int) -> None:
+        """Declare what `obs_type=pixels_agent_pos` shows."""
+        self.features["pixels/top"] = PolicyFeature(type=FeatureType.VISUAL, shape=(height, width, 3))
+        self.features_map["pixels/top"] = f"{OBS_IMAGES}.top"
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """{type: {0: SyncVectorEnv of `n_envs`}}, synchronous whatever `use_async_envs` says.
 
@@ -67,6 +74,16 @@ class DoorKeyEnvConfig(UniMASKEnvConfig):
     fps: int = 10
     """Steps a second."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=2, action=1))
+    obs_type: str = "state"
+    """What is observed: "state", or "pixels_agent_pos", a picture too."""
+
+    def __post_init__(self) -> None:
+        if check_obs_type(self.obs_type) != "state":
+            self.add_camera(96, 96)
+
+    @property
+    def gym_kwargs(self) -> Mapping[str, Any]:
+        return {**super().gym_kwargs, "obs_type": self.obs_type}
 
 
 @EnvConfig.register_subclass("maze2d")
@@ -81,10 +98,22 @@ class Maze2DEnvConfig(UniMASKEnvConfig):
     features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=4, action=2))
     maze: str = "medium"
     """Maze: umaze, medium, large, or its text, a line for each row (see `envs/maze2d/maze.py`)."""
+    obs_type: str = "state"
+    """What is observed: "state", or "pixels_agent_pos", a picture too."""
+    hide_goal: bool = False
+    """Whether the state is the position alone, so that the goal is to be seen in the picture only."""
+
+    def __post_init__(self) -> None:
+        if self.hide_goal:
+            self.features |= state_and_action(state=2, action=2)
+        if check_obs_type(self.obs_type) != "state":
+            rows = parse_maze(self.maze).rows
+            self.add_camera(len(rows) * CAMERA_PIXELS_PER_CELL, len(rows[0]) * CAMERA_PIXELS_PER_CELL)
 
     @property
     def gym_kwargs(self) -> Mapping[str, Any]:
-        return {**super().gym_kwargs, "maze": self.maze}
+        settings = {"maze": self.maze, "obs_type": self.obs_type, "hide_goal": self.hide_goal}
+        return {**super().gym_kwargs, **settings}
 
 
 @EnvConfig.register_subclass("metaworld_state")
