@@ -14,7 +14,6 @@ from draccus import decode
 from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
 from lerobot_unimask.data.factors import (
@@ -36,6 +35,7 @@ from lerobot_unimask.language.grammar import MAX_CONTEXT
 from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK, parse
 from lerobot_unimask.language.training_masks import mixture
 from lerobot_unimask.machine import has_bfloat16
+from lerobot_unimask.optimiser import FusedAdamWConfig
 from lerobot_unimask.records import read_json
 
 logger = logging.getLogger(__name__)
@@ -50,7 +50,6 @@ TOKEN_LAYOUTS = ("stacked", "separate")
 DISCRETE_HEADS = ("joint", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
 UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
-FINE_FROM = 500  # episodes; fewer are learnt by heart from sines and cosines (docs/arm.md)
 # More is a damaged file, or a slip
 MOST = {"width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
 
@@ -134,10 +133,9 @@ class UniMASKConfig(PreTrainedConfig):
     """Share of the training windows that are read causally, with attention=both."""
     token_layout: str = "separate"
     """Tokens of a step. "separate": one for each factor; "stacked", the paper's: one, made of all its factors."""
-    fine_inputs: bool | None = None
-    """Whether continuous values are read with displacements, sines and cosines, which tell places apart that are close
-    together, but let a network learn few episodes by heart; False: as plain numbers, the paper's. None: where the
-    dataset has 500 episodes or more."""
+    fine_inputs: bool = True
+    """Whether continuous values are read with displacements, sines and cosines; False: as plain numbers, the paper's.
+    """
     state_residuals: bool = True
     """Whether continuous states are predicted as departures from the straight course of those shown; False: as plain
     values, the paper's."""
@@ -178,6 +176,9 @@ class UniMASKConfig(PreTrainedConfig):
     """Weight decay of AdamW."""
     optimizer_grad_clip_norm: float = 1.0
     """Norm to which gradients are clipped."""
+    compile_model: bool = False
+    """Whether torch.compile captures what an update computes up to its loss, and the way back: some 20 to 60 s at the
+    start, and on a GPU a few launches for each update instead of hundreds."""
     scheduler_warmup_steps: int = 200
     """Updates in which the learning rate rises; then it falls along a cosine."""
 
@@ -312,8 +313,8 @@ class UniMASKConfig(PreTrainedConfig):
     def reward_delta_indices(self) -> None:
         return None
 
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
+        return FusedAdamWConfig(
             lr=self.optimizer_lr,
             weight_decay=self.optimizer_weight_decay,
             grad_clip_norm=self.optimizer_grad_clip_norm,

@@ -25,7 +25,7 @@ from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.predicting import predict
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
-from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config
+from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, read_weights
 from lerobot_unimask.data.factors import TASK
 from lerobot_unimask.data.returns import EpisodeStarts
@@ -37,8 +37,9 @@ from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMas
 from lerobot_unimask.machine import keep_freed_memory
 from lerobot_unimask.networks import make_network
 from lerobot_unimask.networks.layers import Cache, Predictions
-from lerobot_unimask.networks.losses import LossParts, masked_losses
+from lerobot_unimask.networks.losses import LossParts
 from lerobot_unimask.networks.vision import parameter_groups
+from lerobot_unimask.objective import CapturedLoss, batch_loss
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 from lerobot_unimask.records import read_json
 from lerobot_unimask.sharing import cards, hub
@@ -73,8 +74,6 @@ class UniMASKPolicy(PreTrainedPolicy):
         config.validate_features()
         if dataset_meta is not None and TASK not in config.features:
             config.add_tasks(list(dataset_meta.tasks.index))
-        if config.fine_inputs is None:
-            config.fine_inputs = dataset_meta is None or dataset_meta.total_episodes >= FINE_FROM
         self.factors = config.make_factors()
         self.cameras = config.pictures
         check_settings(config, self.factors)
@@ -89,6 +88,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             cameras=tuple(self.cameras),
         )
         self.network = make_network(config, self.factors, load_backbone=load_backbone)
+        self._batch_loss = CapturedLoss() if config.compile_model else batch_loss
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
         self._loss: Tensor | None = None  # of the last batch that was trained on
         self.origin: hub.Origin | None = None  # where it was loaded from
@@ -131,11 +131,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """
         window = self.make_window(batch)
         step = self.updates if self.training else VALIDATION_STEP
-        mask = self.training_masks(window.valid, frame_index(batch, window), seed=self.config.mask_seed, step=step)
-        window = self.statistics.normalise(window)
-        predictions = self.network(window, mask.shown, mask.causal, asked=mask.asked)
-        losses = masked_losses(predictions, window, mask.asked, self.factors, reduction=reduction)
-        loss = sum(self.config.loss_weights.get(name, 1.0) * part for name, part in losses.items())
+        loss, losses = self._batch_loss(self, window, frame_index(batch, window), step, reduction)
         if self.training:
             self._loss = loss.detach().mean()
         return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
@@ -153,7 +149,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             FloatingPointError: the loss is no longer finite. The last checkpoint is whole: it was saved before.
         """
         if self._loss is not None:
-            check_loss(self._loss, int(self.updates))
+            check_loss(self._loss, self.updates)
         self.updates += 1
 
     def _get_default_peft_targets(self) -> dict[str, Any]:

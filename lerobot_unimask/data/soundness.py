@@ -102,15 +102,15 @@ def compute_statistics(root: Path, key: str) -> dict[str, np.ndarray]:
     return {"mean": values.mean(0), "std": values.std(0)}
 
 
-def check_loss(loss: Tensor, updates: int) -> None:
+def check_loss(loss: Tensor, updates: Tensor | int) -> None:
     """
     Raises:
         FloatingPointError: the loss is no longer finite. The last checkpoint is whole: it was saved before.
     """
     if not loss.isfinite():
         raise FloatingPointError(
-            f"The loss is {loss.item()} after {updates} updates: training ends here, and the last checkpoint is from "
-            "before. A lower optimizer_lr, or optimizer_grad_clip_norm, may help."
+            f"The loss is {loss.item()} after {int(updates)} updates: training ends here, and the last checkpoint is "
+            "from before. A lower optimizer_lr, or optimizer_grad_clip_norm, may help."
         )
 
 

@@ -20,9 +20,9 @@ class TrainingMasks(nn.Module):
     """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
 
     A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
-    apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
-    cloning does, and of pictures those before it, or the same ones for all t. The causal form of random masking shows
-    all of these, each property with probability 1/2, and asks for every state and action but the first state.
+    apart. That holds for questions that ask for one token and show all states, pictures and actions before it, as
+    behaviour cloning does. The causal form of random masking shows all of these, each property with probability 1/2,
+    and asks for every state and action but the first state.
 
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
@@ -111,29 +111,19 @@ class TrainingMasks(nn.Module):
         following = mask.next_tokens(self.cameras)
         if any((following[name] != mask.asked[name]).any() for name in ASKABLE):
             return None
-        shown = table.shown.any(0)
-        for name in self.cameras:  # all t share a window's pictures, those before each
-            if (mask.shown[name] != (shown[self.factors.index(name)] & mask.shown["s"])).any():
-                return None
-        return shown, table.asked.any(0)
+        return table.shown.any(0), table.asked.any(0)
 
     def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
         """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
         causally. All else it answers in both directions."""
         following = mask.next_tokens(self.cameras)
         if self.causal_share > 0 and self.random_task is not None:
-            if not self.cameras:
-                return following
-            whole = torch.stack([mask.shown[name] == mask.shown["s"] for name in self.cameras]).all(0).all(1)
-            if whole.all():
-                return following
-        else:
-            whole = torch.zeros(len(mask.shown["s"]), dtype=torch.bool, device=self.causal_row.device)
+            return following
         learnt = self.causal_row & (self.causal_share > 0)  # (R,)
         shown = torch.stack([mask.shown[name] for name in self.factors], dim=1)  # (B, F, K)
         same = (shown[:, None] == self.shown).all((2, 3)) & learnt  # (B, R)
         return {
-            name: tokens & (whole[:, None] | (same.float() @ self.asked[:, self.factors.index(name)].float() > 0))
+            name: tokens & (same.float() @ self.asked[:, self.factors.index(name)].float() > 0)
             for name, tokens in following.items()
         }
 
@@ -148,8 +138,9 @@ class TrainingMasks(nn.Module):
         """
         B, K = valid.shape
         F = len(self.factors)
-        uniform = counter_uniform(seed, step, index, 4 + F * K)  # (B, 4 + F K)
-        task = torch.searchsorted(self.cumulative_weights, uniform[:, 0].contiguous(), right=True)  # (B,)
+        draw = _uncompiled_uniform if torch.compiler.is_compiling() else counter_uniform
+        uniform = draw(seed, step, index, 4 + F * K)  # (B, 4 + F K)
+        task = (self.cumulative_weights <= uniform[:, :1]).sum(1)  # (B,)
         shown = valid.new_zeros(B, F, K)
         asked = valid.new_zeros(B, F, K)
         if len(self.shown):
@@ -162,7 +153,7 @@ class TrainingMasks(nn.Module):
         causal: Tensor | bool = False
         if self.causal_share > 0:
             causal = uniform[:, -1] < self.causal_share  # (B,)
-            task = torch.searchsorted(self.causal_cumulative_weights, uniform[:, 0].contiguous(), right=True)
+            task = (self.causal_cumulative_weights <= uniform[:, :1]).sum(1)
             history = self.causal_shown[task]
             if self.random_task is not None:
                 history = history & (self.lasting | ~hidden | (task != self.random_task)[:, None, None])
@@ -213,7 +204,7 @@ def validation_masks(
 
 
 def _cumulative(weights: Tensor) -> Tensor:
-    """Where the unit interval is cut so that each task gets its share, for `searchsorted`: (T - 1,)."""
+    """Where the unit interval is cut so that each task gets its share: (T - 1,)."""
     return (weights / weights.sum()).cumsum(0)[:-1].float()
 
 
@@ -254,6 +245,18 @@ def counter_uniform(seed: int, step: Tensor | int, index: Tensor, n: int) -> Ten
     lanes = torch.arange(1, n + 1, device=index.device) * golden
     bits = _mix64(_mix64(key ^ (index * golden))[:, None] + lanes)  # (B, n)
     return _shift_right(bits, 40).float() * 2.0**-24
+
+
+@torch.library.custom_op("unimask::counter_uniform", mutates_args=())
+def _uncompiled_uniform(seed: int, step: Tensor, index: Tensor, n: int) -> Tensor:
+    """`counter_uniform`, kept out of what torch.compile translates: in torch 2.11 its code for these 64-bit integers
+    writes past the end of a buffer on a processor with AVX2."""
+    return counter_uniform(seed, step, index, n)
+
+
+@_uncompiled_uniform.register_fake
+def _(seed: int, step: Tensor, index: Tensor, n: int) -> Tensor:
+    return index.new_empty(len(index), n, dtype=torch.float32)
 
 
 def _mix64(x: Tensor) -> Tensor:

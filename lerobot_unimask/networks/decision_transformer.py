@@ -101,7 +101,8 @@ class DecisionTransformer(nn.Module):
         returns = window.values["rtg"][..., :1]  # (B, K, 1)
         conditioned = shown["rtg"][:, :1]  # (B, 1): of all steps, or none
         known = returns[..., 0].isfinite()
-        if (conditioned & shown["s"] & ~known).any():
+        # A captured update cannot look into its tensors; and recorded windows have their returns.
+        if not torch.compiler.is_compiling() and (conditioned & shown["s"] & ~known).any():
             raise ValueError(
                 "A Decision Transformer reads the return-to-go of every step, and this window has that of its first "
                 "alone. Ask about a recorded window, or in a rollout whose environment reports "

@@ -227,7 +227,13 @@ class Block(nn.Module):
         )
 
     def forward(
-        self, x: Tensor, attend: Tensor | None, past: tuple[Tensor, Tensor] | None, *, read: Tensor | None = None
+        self,
+        x: Tensor,
+        attend: Tensor | None,
+        past: tuple[Tensor, Tensor] | None,
+        *,
+        read: Tensor | None = None,
+        last: bool = False,
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """
         Args:
@@ -236,9 +242,10 @@ class Block(nn.Module):
             past: keys and values of the tokens before them, (B, H, N - n, W/H).
             read: (M,) numbers among the B n tokens of those whose outputs somebody reads; the others' are not computed.
                 None: all.
+            last: whether only the last token's output is computed; it sees all.
 
         Returns:
-            (B, n, W), or (M, W), and the keys and values of all N tokens.
+            (B, n, W), (M, W) or (B, 1, W), and the keys and values of all N tokens.
         """
         B, n, W = x.shape
         qkv = self.query_key_value(self.norm_attention(x)).view(B, n, 3, self.heads, W // self.heads)
@@ -247,6 +254,8 @@ class Block(nn.Module):
         query, key, value = qkv.permute(2, 0, 3, 1, 4)  # each (B, H, n, W/H)
         if past is not None:
             key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
+        if last:
+            x, query, attend = x[:, -1:], query[:, :, -1:], None
         with torch.autocast("cpu", enabled=False):
             attended = self._attend(query, key, value, attend).transpose(1, 2).flatten(2)
         if read is not None:
@@ -255,14 +264,17 @@ class Block(nn.Module):
         return x + self.feedforward(self.norm_feedforward(x)), (key, value)
 
     def _attend(self, query: Tensor, key: Tensor, value: Tensor, attend: Tensor | None) -> Tensor:
-        """(B, H, n, W/H). On a processor PyTorch's own is not fused once it has a dropout, and draws it slowly."""
+        """(B, H, n, W/H). On a processor PyTorch's own is not fused once it has a dropout, which it draws slowly, and a
+        softmax over a short last dimension takes three times as long as over the one before it."""
         dropout = self.dropout.p if self.training else 0.0
-        if dropout == 0 or query.device.type != "cpu" or torch.compiler.is_compiling():
+        B, _, n, size = query.shape
+        short = n <= 64 and B * n >= 256  # not worth more operations, or the memory
+        if query.device.type != "cpu" or torch.compiler.is_compiling() or (dropout == 0 and not short):
             return functional.scaled_dot_product_attention(query, key, value, attn_mask=attend, dropout_p=dropout)
-        scores = (query / math.sqrt(query.shape[-1])) @ key.transpose(2, 3)  # (B, H, n, N)
+        scores = key @ (query / math.sqrt(size)).transpose(2, 3)  # (B, H, N, n)
         if attend is not None:
-            scores = scores.masked_fill(~attend, -math.inf)
-        return self.dropout(scores.softmax(-1)) @ value
+            scores += torch.where(attend.transpose(-2, -1), 0.0, -math.inf)
+        return self.dropout(scores.softmax(-2)).transpose(2, 3) @ value
 
 
 def _before_or_here(tokens: int, device: torch.device) -> Tensor:

@@ -108,7 +108,8 @@ class Transformer(nn.Module):
         tokens = {name: embed(window.values[name], shown[name]) for name, embed in embeddings}
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
         x = self.dropout(x + self.positions)
-        if asked is not None and cache is None and not self.stacked and x.device.type == "cpu":
+        static = x.device.type != "cpu" or torch.compiler.is_compiling()  # how much is computed never depends on masks
+        if asked is not None and cache is None and not self.stacked and not static:
             predictions = self._predict_asked(x, causal, asked)
         else:
             x = self._attend(x, causal) if cache is None else self._extend(x, self._count(shown), cache)
@@ -160,11 +161,10 @@ class Transformer(nn.Module):
         new = x[:, start:count]
         for depth, block in enumerate(self.blocks):
             past = (cache.keys[depth], cache.values[depth]) if start else None
-            last = torch.arange(1, len(x) + 1, device=x.device) * new.shape[1] - 1
-            new, kept = block(new, attend, past, read=last if depth == len(self.blocks) - 1 else None)
+            new, kept = block(new, attend, past, last=depth == len(self.blocks) - 1)
             cache.keys[depth : depth + 1], cache.values[depth : depth + 1] = [kept[0]], [kept[1]]
         cache.inputs = x[:, :count]
-        return functional.pad(new.unsqueeze(1), (0, 0, count - 1, x.shape[1] - count))
+        return functional.pad(new, (0, 0, count - 1, x.shape[1] - count))
 
     def _count(self, shown: dict[str, Tensor]) -> int:
         """Tokens up to the last state, picture or action that is shown in some window."""

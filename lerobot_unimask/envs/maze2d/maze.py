@@ -34,8 +34,6 @@ WALL_OFFSET = 1.0  # where the box of cell 0 stands
 
 MASS_RADIUS = 0.1
 
-CAMERA_PIXELS_PER_CELL = 14  # the smallest maze, of 5 cells, is as large as LeRobot's video codec needs
-
 MAZES = {
     "umaze": """\
 #####

@@ -24,8 +24,7 @@ def make_expert(task: str) -> Any:
     load_metaworld()
     from metaworld.policies import ENV_POLICY_MAP
 
-    policies: dict[str, Any] = ENV_POLICY_MAP
-    return policies[task]()
+    return ENV_POLICY_MAP[task]()
 
 
 def demonstrate(env: MetaWorldEnv, expert: Any, noise: float, rng: np.random.Generator) -> Demonstration | None:

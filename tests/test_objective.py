@@ -1,0 +1,137 @@
+"""Training updates captured by torch.compile: whole, with eager's losses, eager where a batch does not fit."""
+
+import copy
+import functools
+import os
+import traceback
+
+import pytest
+import torch
+
+from lerobot_unimask import objective
+from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+NETWORKS = {
+    "both": {"attention": "both"},
+    "stacked": {"attention": "bidirectional", "token_layout": "stacked"},
+    "causal": {"attention": "causal", "training_masks": "behavior_cloning"},
+    "feedforward": {"network": "feedforward"},
+    "decision_transformer": {"network": "decision_transformer", "training_masks": "behavior_cloning"},
+}
+
+
+def alone(test):
+    """A test in a forked process: after torch.compile has been at work, autograd refuses what is forked from a process,
+    and so would the trainings that other tests fork."""
+
+    @functools.wraps(test)
+    def forked(**fixtures):
+        child = os.fork()
+        if child == 0:
+            try:
+                test(**fixtures)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+
+    return forked
+
+
+def updates(policy, batches):
+    """The losses of one update on each batch."""
+    policy.train()
+    optimiser = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3)
+    losses = []
+    for batch in batches:
+        loss, _ = policy(batch)
+        loss.backward()
+        optimiser.step()
+        optimiser.zero_grad()
+        policy.update()
+        losses.append(loss.item())
+    return torch.tensor(losses)
+
+
+@pytest.fixture
+def capture(monkeypatch):
+    """capture(backend): updates are captured whole, or fail, by this backend; returns a list of the captured graphs."""
+
+    def set_backend(backend):
+        torch._dynamo.reset()
+        graphs = []
+        compiler = torch._dynamo.lookup_backend(backend)
+
+        def counting(graph, inputs, **keywords):
+            graphs.append(graph)
+            return compiler(graph, inputs, **keywords)
+
+        captured = torch.compile(objective.batch_loss, fullgraph=True, dynamic=False, backend=counting)
+        monkeypatch.setattr(objective, "_captured", lambda mode: captured)
+        return graphs
+
+    return set_backend
+
+
+def pair(tiny_policy, kind, **settings):
+    """Two policies of the same weights: one whose updates are captured, one whose are not."""
+    captured, eager = (tiny_policy(kind, dropout=0.0, compile_model=c, **settings) for c in (True, False))
+    eager.load_state_dict(captured.state_dict())
+    return captured, eager
+
+
+@pytest.mark.parametrize(
+    "settings", [pytest.param(s, id=n, marks=pytest.mark.slow if n != "both" else ()) for n, s in NETWORKS.items()]
+)
+@alone
+def test_an_update_is_one_graph_with_eagers_losses(tiny_policy, batch_of, capture, settings):
+    graphs = capture("aot_eager")
+    captured, eager = pair(tiny_policy, "gaussian", **settings)
+    batches = [batch_of("gaussian")] * 5
+    torch.testing.assert_close(updates(captured, batches), updates(eager, batches), rtol=1e-4, atol=1e-4)
+    assert len(graphs) == 1
+
+
+@alone
+def test_a_batch_that_does_not_fit_runs_eagerly(tiny_policy, batch_of, capture):
+    graphs = capture("eager")
+    batch = batch_of("doorkey")
+    small = {key: value[:3] for key, value in batch.items()}
+    captured, eager = pair(tiny_policy, "doorkey")
+    batches = [batch, small, batch]
+    torch.testing.assert_close(updates(captured, batches), updates(eager, batches), rtol=1e-4, atol=1e-4)
+    assert len(graphs) == 1
+    each, _ = captured(batch, reduction="none")
+    assert each.shape == (len(batch["index"]),)
+    captured.eval()
+    assert captured(batch)[0].isfinite()
+    assert len(graphs) == 1
+
+
+@alone
+def test_a_captured_policy_is_saved_loaded_and_copied(tiny_policy, batch_of, capture, tmp_path):
+    capture("eager")
+    batch = batch_of("doorkey")
+    captured, eager = pair(tiny_policy, "doorkey")
+    for policy, name in ((captured, "captured"), (eager, "eager")):
+        updates(policy, [batch] * 2)
+        policy.save_pretrained(tmp_path / name)
+    files = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("captured", "eager")]
+    assert files[0] == files[1]
+    assert captured.state_dict().keys() == eager.state_dict().keys()
+    resumed = UniMASKPolicy.from_pretrained(tmp_path / "captured")
+    assert resumed.config.compile_model
+    twin = copy.deepcopy(captured)
+    expected = updates(captured, [batch] * 2)
+    assert torch.equal(updates(resumed, [batch] * 2)[:1], expected[:1])
+    assert torch.equal(updates(twin, [batch] * 2)[:1], expected[:1])
+
+
+@pytest.mark.slow
+@alone
+def test_a_hundred_compiled_updates_have_eagers_losses(tiny_policy, batch_of, capture):
+    capture("inductor")
+    captured, eager = pair(tiny_policy, "gaussian")
+    batches = [batch_of("gaussian")] * 100
+    torch.testing.assert_close(updates(captured, batches), updates(eager, batches), rtol=1e-4, atol=1e-4)
