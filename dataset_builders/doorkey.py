@@ -1,5 +1,6 @@
 """DoorKey datasets: the noisy-rational expert of the paper, rolled out over the rules' tables."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,10 @@ from lerobot.utils.constants import ACTION, DONE, OBS_STATE, REWARD
 from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing
+from dataset_builders.videos import CAMERA, camera_feature
 from dataset_builders.writer import write_dataset
 from lerobot_unimask.data.returns import return_to_go
+from lerobot_unimask.envs.doorkey.environment import CAMERA_SHAPE, DoorKeyEnv
 from lerobot_unimask.envs.doorkey.episodes import Episodes, rollout
 from lerobot_unimask.envs.doorkey.expert import Expert
 from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, ENV_ID, FPS, HORIZON, TASK
@@ -51,6 +54,7 @@ def build_doorkey(
     expert: Expert = "paper",
     repo_id: str | None = None,
     beta: float = 1.0,
+    camera: bool = False,
     progress: bool = True,
 ) -> Path:
     """Roll out the expert and write a LeRobotDataset.
@@ -64,6 +68,7 @@ def build_doorkey(
         expert: "paper" or "released", see `expert_progress`.
         repo_id: The dataset's name, `ME/NAME`; `local/doorkey` if None.
         beta: The expert's rationality.
+        camera: Whether there is `observation.images.top`, a video of the grid as MiniGrid draws it.
         progress: Show progress bars, on a terminal.
 
     Returns:
@@ -80,22 +85,35 @@ def build_doorkey(
     chunks = [min(CHUNK, episodes - first) for first in range(0, episodes, CHUNK)]
     bar = tqdm(chunks, desc="Rolling out DoorKey", unit="chunk", disable=None if progress else True)
     parts = [frames(rollout(count, rng, expert=expert, beta=beta)) for count in bar]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in FEATURES}
     provenance: dict[str, Any] = {
         "environment": ENV_ID,
         "expert": expert,
         "beta": beta,
         "seed": seed,
         "episodes": episodes,
+        "camera": camera,
     }
     return write_dataset(
         root,
         repo_id=repo_id or "local/doorkey",
         fps=FPS,
-        features=FEATURES,
-        columns={name: np.concatenate([part[name] for part in parts]) for name in FEATURES},
+        features=FEATURES | ({CAMERA: camera_feature(*CAMERA_SHAPE[:2])} if camera else {}),
+        columns=columns,
         lengths=np.full(episodes, HORIZON),
         task=TASK,
         robot_type="doorkey",
         provenance=provenance,
         progress=progress,
+        pictures={CAMERA: _pictures(columns[OBS_STATE], columns[ACTION])} if camera else None,
     )
+
+
+def _pictures(states: np.ndarray, actions: np.ndarray) -> Iterator[np.ndarray]:
+    """What the camera sees before each action of whole episodes, played again: (N, 2) and (N, 1)."""
+    env = DoorKeyEnv()
+    for step, ((agent, key), action) in enumerate(zip(states.tolist(), actions, strict=True)):
+        if step % HORIZON == 0:
+            env.reset(options={"agent": agent, "key": key})
+        yield env.camera_picture()
+        env.step(action)

@@ -10,6 +10,7 @@ import json
 import math
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ import numpy as np
 from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing
+from dataset_builders.videos import CAMERA, camera_feature
 from dataset_builders.writer import dataset_statistics, episode_statistics, write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, _clip
-from lerobot_unimask.envs.maze2d.maze import ENV_ID, FPS, HORIZON, TASK
+from lerobot_unimask.envs.maze2d.maze import ENV_ID, FPS, HORIZON, TASK, parse_maze
+from lerobot_unimask.envs.maze2d.rendering import camera_picture
 
 FEATURES: dict[str, dict[str, Any]] = {
     "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
@@ -79,6 +82,8 @@ def build_maze2d(
     noise: float = 0.5,
     maze: str = "medium",
     repo_id: str | None = None,
+    camera: bool = False,
+    hide_goal: bool = False,
     progress: bool = True,
 ) -> Path:
     """Write the expert's episodes, 200 frames each at 100 frames per second, as a LeRobotDataset.
@@ -92,6 +97,8 @@ def build_maze2d(
         noise: Standard deviation of the normal noise added to each action, before it is clipped to [-1, 1].
         maze: Name or text, see `parse_maze`.
         repo_id: The dataset's name, `ME/NAME`; `local/maze2d` if None.
+        camera: Whether there is `observation.images.top`, a video of the maze, the goal and the mass from above.
+        hide_goal: Whether the state is x and y alone.
         progress: Show progress bars, on a terminal.
 
     Returns:
@@ -108,12 +115,19 @@ def build_maze2d(
         raise ValueError(f"noise is a standard deviation, a finite number from 0 up, got {noise}.")
     columns, initial_velocities = collect_episodes(maze, episodes, seed, noise, progress)
     lengths = np.full(episodes, HORIZON)
+    states, features, pictures = columns["observation.state"], dict(FEATURES), {}
+    if camera:
+        features[CAMERA] = camera_feature(*camera_picture(parse_maze(maze), (1, 1), (1, 1)).shape[:2])
+        pictures[CAMERA] = _pictures(maze, states)
+    if hide_goal:
+        features["observation.state"] = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}
+        columns["observation.state"] = np.ascontiguousarray(states[:, :2])
     columns["observation.return_to_go"] = return_to_go(columns["next.reward"][:, 0], lengths)[:, None]
     return write_dataset(
         root,
         repo_id=repo_id or "local/maze2d",
         fps=FPS,
-        features=FEATURES,
+        features=features,
         columns=columns,
         lengths=lengths,
         task=TASK,
@@ -126,9 +140,19 @@ def build_maze2d(
             "seed": seed,
             "noise": noise,
             "initial_velocity": initial_velocities.tolist(),
+            "camera": camera,
+            "hide_goal": hide_goal,
         },
         progress=progress,
+        pictures=pictures,
     )
+
+
+def _pictures(maze: str, states: np.ndarray) -> Iterator[np.ndarray]:
+    """What the camera sees at each of (N, 4) states: x, y, goal x, goal y."""
+    parsed = parse_maze(maze)
+    for x, y, goal_x, goal_y in states.tolist():
+        yield camera_picture(parsed, (int(goal_x), int(goal_y)), (x, y))
 
 
 def measure_build(episodes: int = 1000, rounds: int = 3) -> dict[str, float]:

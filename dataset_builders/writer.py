@@ -28,6 +28,7 @@ from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, update_chunk_file_indi
 from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing, written_whole
+from dataset_builders.videos import write_videos
 
 PROVENANCE_PATH = "meta/provenance.json"
 # LeRobot writes a row group per episode. That is costly when they are short: 20,000 of ten steps take 48 MB and 15 s to
@@ -52,6 +53,7 @@ def write_dataset(
     robot_type: str,
     provenance: Mapping[str, Any],
     progress: bool = False,
+    pictures: Mapping[str, Iterator[np.ndarray]] | None = None,
 ) -> Path:
     """Write a LeRobotDataset into `root`, completely or not at all.
 
@@ -68,6 +70,7 @@ def write_dataset(
         provenance: How the data came about, for `meta/provenance.json` (info.json keeps no unknown keys); the package's
             version and the command line are added.
         progress: Show a progress bar, on a terminal.
+        pictures: For each feature that is a video the N pictures, (H, W, 3) uint8, as they come.
 
     Returns:
         `root`, as a path.
@@ -78,7 +81,8 @@ def write_dataset(
     """
     root = refuse_existing(root)
     lengths = np.asarray(lengths)
-    _check_columns(features, columns, lengths)
+    pictures = pictures or {}
+    _check_columns({name: feature for name, feature in features.items() if name not in pictures}, columns, lengths)
     with written_whole(root) as new:
         meta = LeRobotDatasetMetadata.create(
             repo_id=repo_id, fps=fps, features=dict(features), robot_type=robot_type, root=new
@@ -89,7 +93,7 @@ def write_dataset(
         columns["task_index"] = np.repeat(meta.tasks.loc[tasks, "task_index"].to_numpy(), lengths)[:, None]
         bar = tqdm(total=len(columns) + 3, desc=f"Writing {root.name}", unit="part", disable=None if progress else True)
         with bar:
-            _write_all(meta, columns, lengths, tasks, bar)
+            _write_all(meta, columns, lengths, tasks, bar, pictures)
         _write_provenance(new, provenance)
         _finish_info(meta, lengths)
     return root
@@ -226,19 +230,31 @@ def dataset_statistics(statistics: EpisodeStatistics) -> dict[str, np.ndarray]:
 
 
 def _write_all(
-    meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray], lengths: np.ndarray, tasks: list[str], bar: tqdm
+    meta: LeRobotDatasetMetadata,
+    columns: dict[str, np.ndarray],
+    lengths: np.ndarray,
+    tasks: list[str],
+    bar: tqdm,
+    pictures: Mapping[str, Iterator[np.ndarray]],
 ) -> None:
     """Statistics, data and episodes; only info.json, which makes it a dataset, still says that it is empty."""
     statistics = {}
     for name, column in columns.items():
         statistics[name] = episode_statistics(column, lengths)
         bar.update()
-    write_stats({name: dataset_statistics(values) for name, values in statistics.items()}, meta.root)
+    videos: dict[str, list] = {}
+    whole = {name: dataset_statistics(values) for name, values in statistics.items()}
+    for key, frames in pictures.items():
+        places, found = write_videos(meta, key, frames, lengths)
+        whole[key] = aggregate_feature_stats(found)
+        videos |= places
+        videos |= {f"stats/{key}/{name}": [each[name].tolist() for each in found] for name in found[0]}
+    write_stats(whole, meta.root)
     bar.update()
     chunk, file = _write_tables(meta, meta.data_path, _data_table(meta, columns), lengths, ROW_GROUP_FRAMES)
     bar.update()
     episodes = _episode_columns(lengths, tasks, chunk, file, statistics)
-    _write_episodes(meta, episodes)
+    _write_episodes(meta, episodes | {name: pa.array(values) for name, values in videos.items()})
     bar.update()
 
 

@@ -50,6 +50,7 @@ TOKEN_LAYOUTS = ("stacked", "separate")
 DISCRETE_HEADS = ("joint", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian")
 UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
+FINE_FROM = 500  # episodes; fewer are learnt by heart from sines and cosines (docs/arm.md)
 # More is a damaged file, or a slip
 MOST = {"width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
 
@@ -133,9 +134,10 @@ class UniMASKConfig(PreTrainedConfig):
     """Share of the training windows that are read causally, with attention=both."""
     token_layout: str = "separate"
     """Tokens of a step. "separate": one for each factor; "stacked", the paper's: one, made of all its factors."""
-    fine_inputs: bool = True
-    """Whether continuous values are read with displacements, sines and cosines; False: as plain numbers, the paper's.
-    """
+    fine_inputs: bool | None = None
+    """Whether continuous values are read with displacements, sines and cosines, which tell places apart that are close
+    together, but let a network learn few episodes by heart; False: as plain numbers, the paper's. None: where the
+    dataset has 500 episodes or more."""
     state_residuals: bool = True
     """Whether continuous states are predicted as departures from the straight course of those shown; False: as plain
     values, the paper's."""

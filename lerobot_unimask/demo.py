@@ -13,6 +13,7 @@ import re
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from lerobot.scripts import lerobot_eval, lerobot_train
@@ -88,8 +89,9 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
         figure.savefig(output / name, dpi=200)
         print(f"  {output / name}")
 
+    seconds = round(time.monotonic() - began, 1)
     record = {
-        "seconds": round(time.monotonic() - began, 1),
+        "seconds": seconds,
         "episodes": {"training": EPISODES, "unseen": UNSEEN_EPISODES},
         "updates": steps,
         "rollouts": rollouts,
@@ -101,7 +103,7 @@ def run_demo(output: Path, *, steps: int = STEPS) -> dict:
         "versions": versions(),
     }
     write_json(output / "demo.json", record, say=False)
-    _close(output, checkpoint, record["seconds"])
+    _close(output, checkpoint, seconds)
     return record
 
 
@@ -177,7 +179,7 @@ def _run(log: Path, script: str, *arguments: str, total: int | None = None) -> N
     """
     print(f"  {script}; its output is in {log}", flush=True)
     log.touch()
-    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    context: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     process = context.Process(target=_become, args=(log, script, *arguments))
     process.start()
     with tqdm(total=total, desc="  training", disable=None if total else True, leave=False) as bar:

@@ -37,6 +37,7 @@ def apply() -> None:
     _read_as_this_policy_needs()
     _work_offline()
     _record_integers()
+    _say_in_a_line_what_decodes()
 
 
 def _read_windows_in_batches() -> None:
@@ -105,6 +106,22 @@ def _read_as_this_policy_needs() -> None:
     for name in ("lerobot.datasets", "lerobot.scripts.lerobot_train"):  # where LeRobot has imported it by name
         if name in sys.modules:
             sys.modules[name].make_train_eval_datasets = make_train_eval_datasets
+
+
+def _say_in_a_line_what_decodes() -> None:
+    """Where FFmpeg is missing LeRobot logs a page about it whenever a dataset is opened, with videos or without.
+
+    Other policies: the same line once, instead of the page each time.
+    """
+    said: list[str] = []
+
+    def shorten(record: logging.LogRecord) -> bool:
+        line = record.getMessage().splitlines()[-1].replace(" (see the error above)", "")
+        record.msg, record.args = line, None
+        said.append(line)
+        return line not in said[:-1]
+
+    logging.getLogger("lerobot.utils.import_utils").addFilter(shorten)
 
 
 def _work_offline() -> None:

@@ -79,7 +79,7 @@ def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     for t in table.t.tolist():
         mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
         answer = answer_question(policy, recorded, mask)
-        error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.a_std
+        error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.get_buffer("a_std")
         errors.append(error[mask.asked["a"][:, t]].square().flatten())
     return torch.cat(errors).mean().item()
 
@@ -97,7 +97,7 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
         causal, both = (policy.network(window, mask.shown, direction)["a"] for direction in (True, False))
         outputs = policy.factors["a"].outputs
         parts = [_divergence(p[:, t], q[:, t], output) for p, q, output in zip(causal, both, outputs, strict=True)]
-        found.append(sum(parts)[mask.asked["a"][:, t]])
+        found.append(torch.stack(parts).sum(0)[mask.asked["a"][:, t]])
     return torch.cat(found).mean().item()
 
 
@@ -117,7 +117,7 @@ def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> d
     """Milliseconds of `select_action` once the window slides, with the policy's own inference mask: median and
     quartiles over the calls."""
     policy.reset()
-    mean = policy.statistics.s_mean
+    mean = policy.statistics.get_buffer("s_mean")
     times = []
     for call in range(calls + policy.config.context_length):
         state = mean.expand(environments, -1).clone()

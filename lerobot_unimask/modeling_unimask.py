@@ -25,7 +25,7 @@ from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.predicting import predict
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
-from lerobot_unimask.configuration_unimask import UniMASKConfig, read_config
+from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, read_weights
 from lerobot_unimask.data.factors import TASK
 from lerobot_unimask.data.returns import EpisodeStarts
@@ -74,6 +74,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         config.validate_features()
         if dataset_meta is not None and TASK not in config.features:
             config.add_tasks(list(dataset_meta.tasks.index))
+        if config.fine_inputs is None:
+            config.fine_inputs = dataset_meta is None or dataset_meta.total_episodes >= FINE_FROM
         self.factors = config.make_factors()
         self.cameras = config.pictures
         check_settings(config, self.factors)

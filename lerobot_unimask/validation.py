@@ -99,7 +99,7 @@ def validate(
     """
     results: list[dict[str, Any]] = []
     chosen: list[UniMASKPolicy] = []
-    dataset = None
+    dataset: Any = None
     for run in runs:
         curve: dict[int, float] = {}
         for path in checkpoints_of(Path(run)) if Path(run).is_dir() else [run]:

@@ -328,3 +328,17 @@ def test_what_looks_learns_at_a_rate_of_its_own(make):
 def test_a_resnet_looks(make, batch):
     policy = make(vision_backbone="resnet18", image_size=[64, 64], cameras=["observation.images.top"])
     assert policy.select_action(observation(batch, 0)).isfinite().all()
+
+
+def test_one_picture_serves_all_steps_of_a_causal_window(make, batch):
+    """`top[0]` is before every action, so that a causal window has them all for one picture; `top[t]` is not."""
+    question = "a[t] | state[:t+1], a[:t], top[0]"
+    policy = make(training_masks=question, attention="causal", cameras=["observation.images.top"])
+    mask = policy.training_masks(torch.ones(3, K, dtype=torch.bool), batch["index"], seed=0, step=0)
+    assert mask.draw().startswith("s ######  a ######") or mask.asked["a"].all()
+    assert mask.shown["top"].sum(1).tolist() == [1, 1, 1]
+    assert policy.infer(batch, question, t=3).most_likely("a")[:, 3].isfinite().all()
+    with pytest.raises(MaskError, match="attends causally alone"):
+        make(training_masks="a[t] | state[:t+1], a[:t], top[t]", attention="causal")
+    with pytest.raises(MaskError, match="attends causally alone"):
+        policy.infer(batch, "a[t] | state[:t+1], a[:t]", t=3)

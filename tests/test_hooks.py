@@ -1,6 +1,7 @@
 """LeRobot's other hooks: losses of windows, recorded evaluations, renamed columns, adapters, other environments."""
 
 import json
+import logging
 import re
 
 import commands
@@ -175,3 +176,11 @@ def test_states_are_made_up_of_the_columns_that_are_named(tiny_policy):
 def test_columns_that_cannot_be_states_are_refused(tiny_policy, states):
     with pytest.raises(ValueError, match=r"states|observation\.state"):
         tiny_policy("gaussian", features=COLUMNS, stats=CONTINUOUS_STATS, states=states)
+
+
+def test_lerobots_page_about_ffmpeg_is_one_line_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(2):
+        logging.getLogger("lerobot.utils.import_utils").warning(
+            "A page.\nOf it.\nIt reads by pyav (see the error above)."
+        )
+    assert caplog.messages == ["It reads by pyav."]

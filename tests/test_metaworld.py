@@ -4,11 +4,14 @@ import commands
 import numpy as np
 import pytest
 import torch
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env
 from lerobot.envs.factory import make_env_config
+from lerobot.policies.factory import make_policy
 
 from dataset_builders.metaworld import build_metaworld
+from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.episodes import bounds_of, provenance_of
 from lerobot_unimask.envs.metaworld.environment import HAND, OBJECT, MetaWorldEnv, describe_task
 from lerobot_unimask.envs.metaworld.expert import demonstrate, make_expert
@@ -79,6 +82,15 @@ def test_several_tasks_make_one_dataset(root, tmp_path):
     assert torch.equal(dataset[0]["action"], alone[0]["action"])
     assert dataset[0]["observation.environment_state"].shape == (2 * OBJECT + 3,)
     assert provenance_of(both)["failures"].keys() == {TASK, "stick-push-v3"}
+
+
+@pytest.mark.parametrize(("least", "fine"), [(EPISODES, True), (EPISODES + 1, False)])
+def test_few_episodes_are_read_as_plain_numbers(root, monkeypatch, least, fine):
+    monkeypatch.setattr("lerobot_unimask.modeling_unimask.FINE_FROM", least)
+    config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16)
+    policy = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/arm", root=root))
+    assert policy.config.fine_inputs is fine
+    assert policy.network.embeddings["s"].encoding.fine is fine
 
 
 def test_it_trains_and_is_evaluated_by_lerobots_loops(root, tmp_path):

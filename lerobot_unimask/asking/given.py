@@ -172,7 +172,7 @@ def check_values(what: str, values: Tensor, factor: Factor) -> None:
     if not fine.all():
         raise ValueError(f"{what} holds {values[~fine][0].item()}; its numbers must be finite.")
     for component in factor.components:
-        if component.discrete:
+        if component.categories is not None:
             numbers = values[..., component.dims]
             bad = (numbers < 0) | (numbers >= component.categories) | (numbers != numbers.round())
             if bad.any():

@@ -270,7 +270,7 @@ def training(
     }
     counted = step[WARM_UP:]
     return {
-        "step_ms": spread(1000 * counted),
+        "step_ms": spread((1000 * counted).tolist()),
         "steps_per_second": 1 / np.median(counted),
         "share": {name: seconds[WARM_UP:].sum() / counted.sum() for name, seconds in pieces.items()},
         "threads": torch.get_num_threads(),
@@ -363,7 +363,7 @@ def updating(settings: Mapping[str, Any], root: Path, batch_size: int, updates: 
     settings = {name: value for name, value in settings.items() if name != "type"}
     trainer = Trainer(settings, root, seed=0, steps=updates + WARM_UP, batch_size=batch_size)
     ends = [now() for _ in trainer]
-    return {"step_ms": spread(1000 * np.diff(ends)[WARM_UP - 1 :])}
+    return {"step_ms": spread((1000 * np.diff(ends)[WARM_UP - 1 :]).tolist())}
 
 
 def _maze_policy(settings: Mapping[str, Any], root: Path) -> UniMASKPolicy:

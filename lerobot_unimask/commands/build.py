@@ -20,13 +20,18 @@ def add(commands: Any) -> None:
         default="paper",
         help="how the expert counts a bump into a wall: as the paper's text says, or as its authors' code does",
     )
-    doorkey.set_defaults(run=_build, settings=("expert",))
+    _camera(doorkey)
+    doorkey.set_defaults(run=_build, settings=("expert", "camera"))
 
     maze2d = add_command(environments, "maze2d", "a point mass in a maze, a waypoint controller")
     _dataset(maze2d, episodes=1000)
     maze2d.add_argument("--noise", type=float, default=0.5, help="standard deviation of the noise on actions")
     maze2d.add_argument("--maze", default="medium", help="umaze, medium, large, or a maze's own text")
-    maze2d.set_defaults(run=_build, settings=("noise", "maze"))
+    _camera(maze2d)
+    maze2d.add_argument(
+        "--hide_goal", type=boolean, default=False, metavar="true", help="leave the goal out of the state"
+    )
+    maze2d.set_defaults(run=_build, settings=("noise", "maze", "camera", "hide_goal"))
 
     metaworld = add_command(environments, "metaworld", "tasks of MetaWorld for a Sawyer arm, scripted experts (extra)")
     _dataset(metaworld, episodes=100)
@@ -44,6 +49,12 @@ def _dataset(parser: argparse.ArgumentParser, *, episodes: int) -> None:
     parser.add_argument("--repo_id", metavar="ME/NAME", help="the dataset's name on the Hub")
     parser.add_argument("--push_to_hub", type=boolean, default=False, metavar="true", help="push it when it is built")
     private_flag(parser)
+
+
+def _camera(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--camera", type=boolean, default=False, metavar="true", help="add observation.images.top, a video from above"
+    )
 
 
 def _build(arguments: argparse.Namespace) -> None:

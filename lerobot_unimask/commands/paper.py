@@ -88,13 +88,14 @@ def _study(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.paper import ablation, heatmap, search, table
     from lerobot_unimask.paper.study import read_config
 
-    kind, run, markdown = {
+    parts: dict[str, tuple[type, Any, Any]] = {
         "heatmap": (heatmap.HeatmapConfig, heatmap.heatmap, heatmap.markdown),
         "table": (table.TableConfig, table.table, table.markdown),
         "search": (search.SearchConfig, search.search, search.markdown),
         "ablation": (ablation.AblationConfig, ablation.ablation, ablation.markdown),
-    }[arguments.part]
-    config = read_config(kind, arguments.config_path)
+    }
+    kind, run, markdown = parts[arguments.part]
+    config: Any = read_config(kind, arguments.config_path)
     print(markdown(run(config, storage=arguments.storage, workers=arguments.workers)))
     print(f"written to {config.output}")
 

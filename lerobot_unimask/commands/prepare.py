@@ -85,6 +85,7 @@ def _run(arguments: argparse.Namespace) -> None:
 def _label(arguments: argparse.Namespace, root: Path, output: Path | None) -> Path:
     from dataset_builders import label
 
+    labeller: label.Labeller
     if arguments.return_to_go:
         name, labeller, how = arguments.name or "observation.return_to_go", label.remaining_return, "return-to-go"
     elif arguments.name is None:

@@ -61,9 +61,9 @@ def _train_config(checkpoint: str | Path) -> dict[str, Any] | None:
     return read_json(path) if path.exists() else None
 
 
-def training_settings(checkpoint: str | Path) -> dict[str, Any] | None:
+def training_settings(checkpoint: str | Path | None) -> dict[str, Any] | None:
     """What lerobot-train saved beside the weights: the policy's settings, the seed, the data and its provenance."""
-    config = _train_config(checkpoint)
+    config = _train_config(checkpoint) if checkpoint is not None else None
     if config is None:
         return None
     root = config["dataset"].get("root")

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from string import Formatter
-from typing import Any
+from typing import Any, NoReturn
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
@@ -45,11 +45,11 @@ def read_info(root: Path) -> dict[str, Any]:
     if not isinstance(info, dict):
         raise ValueError(f"{path} holds a {type(info).__name__}; it is a mapping of entries.")
 
-    def refuse(entry: str, value: Any, wanted: str) -> None:
+    def refuse(entry: str, value: Any, wanted: str) -> NoReturn:
         raise ValueError(f"{path} has {entry} {str(value)[:80]!r}; it is {wanted}.")
 
     fps, features = info.get("fps"), info.get("features")
-    if not _is_number(fps) or not 0 < fps <= MAX_FPS:
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps <= MAX_FPS:
         refuse("fps", fps, f"a number above 0, at most {MAX_FPS}")
     if not isinstance(features, dict):
         refuse("features", features, "a mapping of columns")

@@ -118,7 +118,9 @@ def _build(dataset: LeRobotDataset, key: str, shape: tuple[int, ...], path: Path
 
     lock = threading.Lock()
     stopped = threading.Event()
-    bar = tqdm(total=sum(end - start for runs in files.values() for _, start, end in runs), unit="frame", desc=key)
+    bar = tqdm(
+        total=sum(end - start for runs in files.values() for _, start, end in runs), unit="frame", desc=f"{key}, once"
+    )
 
     def decode_file(runs: list[tuple[int, int, int]]) -> None:
         for episode, start, end in runs:

@@ -147,8 +147,11 @@ def _read_columns(hf_dataset: datasets.Dataset, meta: LeRobotDatasetMetadata) ->
             continue  # an image, which `serve_frames` decodes
         if not isinstance(row, torch.Tensor) or row.numel() == 0:
             return None
-        pieces = [_flat_numbers(batch.column(key)) for batch in batches]
-        if any(p is None or len(p) != len(batch) * row.numel() for p, batch in zip(pieces, batches, strict=True)):
+        numbers = [_flat_numbers(batch.column(key)) for batch in batches]
+        pieces = [
+            p for p, batch in zip(numbers, batches, strict=True) if p is not None and len(p) == len(batch) * row.numel()
+        ]
+        if len(pieces) < len(batches):
             return None
         columns[key] = _make_column(pieces, ends, row)
     return Columns(
@@ -209,7 +212,7 @@ def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobot
     dataset.reader.hf_dataset = hf_dataset.remove_columns([key for key in unread if key in hf_dataset.column_names])
     if not wanted or not settings.cache_frames:
         return
-    if whole in _frames and whole is not None:
+    if whole is not None and whole in _frames:
         index, of_whole = (one.hf_dataset.data.column("index").to_numpy() for one in (dataset, whole))
         rows = np.searchsorted(of_whole, index)
         _frames[dataset] = {key: Rows(frames, rows) for key, frames in _frames[whole].items()}

@@ -7,14 +7,16 @@ One environment is one `EnvConfig` of a few lines: its `task`, which with the pa
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from lerobot_unimask.envs.cameras import check_obs_type
+from lerobot_unimask.envs.maze2d.maze import CAMERA_PIXELS_PER_CELL, parse_maze
 from lerobot_unimask.envs.returns import ReportReturn
 
 
@@ -48,6 +50,11 @@ class UniMASKEnvConfig(EnvConfig):
     def gym_kwargs(self) -> Mapping[str, Any]:
         return {"render_mode": "rgb_array"}
 
+    def add_camera(self, height: int, width: int) -> None:
+        """Declare what `obs_type=pixels_agent_pos` shows."""
+        self.features["pixels/top"] = PolicyFeature(type=FeatureType.VISUAL, shape=(height, width, 3))
+        self.features_map["pixels/top"] = f"{OBS_IMAGES}.top"
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """{type: {0: SyncVectorEnv of `n_envs`}}, synchronous whatever `use_async_envs` says.
 
@@ -63,8 +70,20 @@ class DoorKeyEnvConfig(UniMASKEnvConfig):
     """`--env.type=doorkey`"""
 
     task: str | None = "DoorKey-v0"
+    """Name of the environment."""
     fps: int = 10
+    """Steps a second."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=2, action=1))
+    obs_type: str = "state"
+    """What is observed: "state", or "pixels_agent_pos", a picture too."""
+
+    def __post_init__(self) -> None:
+        if check_obs_type(self.obs_type) != "state":
+            self.add_camera(96, 96)
+
+    @property
+    def gym_kwargs(self) -> Mapping[str, Any]:
+        return {**super().gym_kwargs, "obs_type": self.obs_type}
 
 
 @EnvConfig.register_subclass("maze2d")
@@ -73,13 +92,28 @@ class Maze2DEnvConfig(UniMASKEnvConfig):
     """`--env.type=maze2d`"""
 
     task: str | None = "Maze2D-v0"
+    """Name of the environment."""
     fps: int = 100
+    """Steps a second."""
     features: dict[str, PolicyFeature] = field(default_factory=lambda: state_and_action(state=4, action=2))
-    maze: str = "medium"  # umaze, medium, large, or a maze's text (see `envs/maze2d.py`)
+    maze: str = "medium"
+    """Maze: umaze, medium, large, or its text, a line for each row (see `envs/maze2d/maze.py`)."""
+    obs_type: str = "state"
+    """What is observed: "state", or "pixels_agent_pos", a picture too."""
+    hide_goal: bool = False
+    """Whether the state is the position alone, so that the goal is to be seen in the picture only."""
+
+    def __post_init__(self) -> None:
+        if self.hide_goal:
+            self.features |= state_and_action(state=2, action=2)
+        if check_obs_type(self.obs_type) != "state":
+            rows = parse_maze(self.maze).rows
+            self.add_camera(len(rows) * CAMERA_PIXELS_PER_CELL, len(rows[0]) * CAMERA_PIXELS_PER_CELL)
 
     @property
     def gym_kwargs(self) -> Mapping[str, Any]:
-        return {**super().gym_kwargs, "maze": self.maze}
+        settings = {"maze": self.maze, "obs_type": self.obs_type, "hide_goal": self.hide_goal}
+        return {**super().gym_kwargs, **settings}
 
 
 @EnvConfig.register_subclass("metaworld_state")
@@ -124,8 +158,11 @@ class GymnasiumEnvConfig(UniMASKEnvConfig):
     """
 
     task: str | None = None
-    package: str | None = None  # whose import registers the environment, such as gym_pusht
+    """gymnasium id of the environment."""
+    package: str | None = None
+    """Package whose import registers the environment, such as gym_pusht."""
     fps: int = 30
+    """Steps a second."""
 
     def __post_init__(self) -> None:
         if self.task is None:
@@ -135,14 +172,18 @@ class GymnasiumEnvConfig(UniMASKEnvConfig):
         env = self._make()
         if not isinstance(env.action_space, gym.spaces.Box):
             raise ValueError(f"{self.task} takes {env.action_space}; --env.type=gymnasium takes continuous actions.")
-        own = {name: space for name, space in env.observation_space.spaces.items() if len(space.shape or ()) == 1}
+        own = {
+            name: space
+            for name, space in cast(gym.spaces.Dict, env.observation_space).spaces.items()
+            if len(space.shape or ()) == 1
+        }
         self.features = {ACTION: PolicyFeature(FeatureType.ACTION, env.action_space.shape)}
         self.features |= {name: PolicyFeature(FeatureType.STATE, space.shape) for name, space in own.items()}
         self.features_map |= {name: f"observation.{name}" for name in own if name not in self.features_map}
         env.close()
 
     def _make(self) -> gym.Env:
-        return ReportReturn(gym.make(self.task, disable_env_checker=True, **self.gym_kwargs))
+        return ReportReturn(gym.make(str(self.task), disable_env_checker=True, **self.gym_kwargs))
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """As the other environments'."""

@@ -30,7 +30,7 @@ class ReportReturn(gym.Wrapper):
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._paid += float(reward)
-        return self._with_return(observation), reward, terminated, truncated, info
+        return self._with_return(observation), float(reward), terminated, truncated, info
 
     def _with_return(self, observation: Any) -> dict[str, Any]:
         own = observation if self._own is not None else {"agent_pos": np.asarray(observation, np.float32)}

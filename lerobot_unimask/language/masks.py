@@ -256,7 +256,7 @@ def _select(
                         text,
                         part.position,
                     )
-                steps = (step % K,)
+                steps = range(step % K, step % K + 1)
             if own not in (*ASKABLE, *cameras) and any(steps):
                 raise MaskError(
                     f"{term.factor} can be shown at step 0 only: write {term.factor}[0].", text, term.position
@@ -314,17 +314,17 @@ class Mask:
         )
 
     def next_tokens(self, cameras: Sequence[str] = ()) -> dict[str, Tensor]:
-        """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state,
-        picture and action before it and none after; properties may be shown or not."""
-        names = ("s", *cameras, "a")
+        """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and
+        action before it, any of the pictures before it, and nothing after; properties may be shown or not."""
         shown, asked = (
-            torch.stack([tokens[name] for name in names], dim=-1).flatten(1) for tokens in (self.shown, self.asked)
-        )  # (B, n K), in the order of time
+            torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1) for tokens in (self.shown, self.asked)
+        )  # (B, 2 K), in the order of time
         order = torch.arange(shown.shape[1], device=shown.device)
         count = shown.sum(1, keepdim=True)
         history = shown.any(1, keepdim=True) & (shown == (order < count)).all(1, keepdim=True)
-        following = (history & asked & (order == count)).unflatten(1, (-1, len(names)))  # (B, K, n)
-        return {"s": following[..., 0], "a": following[..., -1]}
+        for name in cameras:  # a picture stands after its step's state, which is shown where it is before
+            history = history & (~self.shown[name] | self.shown["s"]).all(1, keepdim=True)
+        return dict(zip(ASKABLE, (history & asked & (order == count)).unflatten(1, (-1, 2)).unbind(-1), strict=True))
 
     def draw(self, window: int = 0) -> str:
         """One window's mask as text, in the notation of the class's docstring."""

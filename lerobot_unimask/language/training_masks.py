@@ -20,9 +20,9 @@ class TrainingMasks(nn.Module):
     """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
 
     A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
-    apart. That holds for questions that ask for one token and show all states, pictures and actions before it, as
-    behaviour cloning does. The causal form of random masking shows all of these, each property with probability 1/2,
-    and asks for every state and action but the first state.
+    apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
+    cloning does, and of pictures those before it, or the same ones for all t. The causal form of random masking shows
+    all of these, each property with probability 1/2, and asks for every state and action but the first state.
 
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
@@ -111,19 +111,29 @@ class TrainingMasks(nn.Module):
         following = mask.next_tokens(self.cameras)
         if any((following[name] != mask.asked[name]).any() for name in ASKABLE):
             return None
-        return table.shown.any(0), table.asked.any(0)
+        shown = table.shown.any(0)
+        for name in self.cameras:  # all t share a window's pictures, those before each
+            if (mask.shown[name] != (shown[self.factors.index(name)] & mask.shown["s"])).any():
+                return None
+        return shown, table.asked.any(0)
 
     def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
         """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
         causally. All else it answers in both directions."""
         following = mask.next_tokens(self.cameras)
         if self.causal_share > 0 and self.random_task is not None:
-            return following
+            if not self.cameras:
+                return following
+            whole = torch.stack([mask.shown[name] == mask.shown["s"] for name in self.cameras]).all(0).all(1)
+            if whole.all():
+                return following
+        else:
+            whole = torch.zeros(len(mask.shown["s"]), dtype=torch.bool, device=self.causal_row.device)
         learnt = self.causal_row & (self.causal_share > 0)  # (R,)
         shown = torch.stack([mask.shown[name] for name in self.factors], dim=1)  # (B, F, K)
         same = (shown[:, None] == self.shown).all((2, 3)) & learnt  # (B, R)
         return {
-            name: tokens & (same.float() @ self.asked[:, self.factors.index(name)].float() > 0)
+            name: tokens & (whole[:, None] | (same.float() @ self.asked[:, self.factors.index(name)].float() > 0))
             for name, tokens in following.items()
         }
 

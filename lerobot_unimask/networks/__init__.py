@@ -22,7 +22,7 @@ def make_network(config: UniMASKConfig, factors: dict[str, Factor], *, load_back
     """
     shared: dict[str, Any] = {
         "context_length": config.context_length,
-        "fine_inputs": config.fine_inputs,
+        "fine_inputs": config.fine_inputs is not False,
         "width": config.width,
         "depth": config.depth,
         "feedforward_width": config.feedforward_width,

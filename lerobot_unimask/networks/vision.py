@@ -21,10 +21,12 @@ KEYPOINTS = 32  # as in LeRobot's diffusion policy: 64 numbers for each picture
 
 
 def _convolutions(channels: int) -> nn.Module:
-    """Three layers that two processor cores can train: a picture of 96 x 96 becomes 64 maps of 12 x 12."""
+    """Three layers that two processor cores can train, those of Mnih et al. (2015) with group norms: a picture of 96 x
+    96 becomes 64 maps of 12 x 12."""
     layers: list[nn.Module] = []
-    for before, after in ((channels, 32), (32, 64), (64, 64)):
-        layers += [nn.Conv2d(before, after, 3, stride=2, padding=1), nn.GroupNorm(after // 16, after), nn.ReLU()]
+    for before, after, kernel, stride in ((channels, 32, 8, 4), (32, 64, 4, 2), (64, 64, 3, 1)):
+        convolution = nn.Conv2d(before, after, kernel, stride, padding=(kernel - stride + 1) // 2)
+        layers += [convolution, nn.GroupNorm(after // 16, after), nn.ReLU()]
     return nn.Sequential(*layers)
 
 

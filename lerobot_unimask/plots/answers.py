@@ -1,6 +1,7 @@
 """Masks and answers of any model: which tokens are shown and asked for, and what is said about them."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -99,7 +100,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
         colorbar = figure.colorbar(probability, ax=list(grid), shrink=0.8, aspect=25, pad=0.01)
         colorbar.set_label("probability", fontsize=SMALL + 1)
         colorbar.ax.tick_params(labelsize=SMALL, length=2)
-    point = {"marker": "x", "linestyle": "none", "markersize": 5, "color": VERMILLION}
+    point: dict[str, Any] = {"marker": "x", "linestyle": "none", "markersize": 5, "color": VERMILLION}
     handles = [shown_handle()] + [Line2D([], [], label="recorded", **point)] * (truth is not None)
     figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=SMALL + 1, frameon=False)
     return figure
@@ -160,8 +161,8 @@ def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -
     for name in ASKABLE:
         for component in factors[name].components:
             for i in range(component.dims.start, component.dims.stop):
-                values = {group: window.values[name][..., i][window.valid] for group, window in groups.items()}
-                values = {group: v[~v.isnan()].numpy(force=True) for group, v in values.items()}
+                column = {group: window.values[name][..., i][window.valid] for group, window in groups.items()}
+                values = {group: v[~v.isnan()].numpy(force=True) for group, v in column.items()}
                 if all(map(len, values.values())):
                     label = component.names[i - component.dims.start]
                     parts.append((f"{name}: {label}", component, values))
@@ -173,19 +174,19 @@ def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -
     for axes, (label, component, values) in zip(grid, parts, strict=False):
         low, high = min(v.min() for v in values.values()), max(v.max() for v in values.values())
         for n, ((group, numbers), colour) in enumerate(zip(values.items(), (BLUE, VERMILLION, BLACK), strict=False)):
-            if component.discrete:
+            if component.categories is not None:
                 share = np.bincount(numbers.astype(int), minlength=component.categories) / len(numbers)
                 thickness = 0.8 / len(values)
                 offset = (n - (len(values) - 1) / 2) * thickness
                 axes.bar(np.arange(component.categories) + offset, share, thickness, color=colour, label=group)
             else:
                 weights = np.full(len(numbers), 1 / len(numbers))
-                style = {"histtype": "step", "linewidth": 1.4, "color": colour, "label": group}
+                style: dict[str, Any] = {"histtype": "step", "linewidth": 1.4, "color": colour, "label": group}
                 axes.hist(numbers, np.linspace(low, high, 40), weights=weights, **style)
         axes.set_xlabel(label, fontsize=SMALL + 1)
         axes.set_ylabel("share", fontsize=SMALL + 1)
         axes.tick_params(labelsize=SMALL)
-        if component.discrete:
+        if component.categories is not None:
             axes.set_xticks(range(0, component.categories, max(1, component.categories // 8)))
     for axes in list(figure.axes)[len(parts) :]:
         axes.set_axis_off()

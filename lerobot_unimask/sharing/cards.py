@@ -134,9 +134,10 @@ def _random_example(factors: tuple[str, ...], K: int) -> Mask:
     )
     hidden = torch.cat(list(draws.asked.values()), dim=1).sum(1)  # (64,)
     best = int((hidden - K).abs().argmin())
-    return Mask(
-        *({name: tokens[best : best + 1] for name, tokens in part.items()} for part in (draws.shown, draws.asked))
+    shown, asked = (
+        {name: tokens[best : best + 1] for name, tokens in part.items()} for part in (draws.shown, draws.asked)
     )
+    return Mask(shown, asked)
 
 
 def _model(facts: PolicyFacts) -> str:

@@ -301,14 +301,14 @@ def _status(error: BaseException | None) -> int | None:
     return error.response.status_code if isinstance(error, HfHubHTTPError) else None
 
 
-def _answer(error: BaseException) -> BaseException:
+def _answer(error: BaseException) -> Any:
     """What the Hub answered, among the causes of an error; else the first cause."""
     while error.__cause__ is not None and _status(error) is None:
         error = error.__cause__
     return error
 
 
-def _refusal(error: BaseException) -> str:
+def _refusal(error: Any) -> str:
     """A sentence about what came back from the Hub, and what to do."""
     hub, status = f"the Hub at {constants.ENDPOINT}", _status(error)
     if status == 401:

@@ -25,6 +25,7 @@ from minigrid.core.mission import MissionSpace
 from minigrid.core.world_object import Door, Goal, Key
 from minigrid.minigrid_env import MiniGridEnv
 
+from lerobot_unimask.envs.cameras import check_obs_type, pixels_space
 from lerobot_unimask.envs.doorkey.rules import (
     _SIZE,
     _WALL_X,
@@ -40,6 +41,8 @@ from lerobot_unimask.envs.doorkey.rules import (
     coordinates,
     reward,
 )
+
+CAMERA_SHAPE = (96, 96, 3)
 
 
 class _DoorKeyGrid(MiniGridEnv):
@@ -100,7 +103,8 @@ class DoorKeyEnv(gym.Env):
     """DoorKey as a gymnasium environment that LeRobot's evaluation loop can run.
 
     Observation: `agent_pos`, (2,) int64, the agent's cell and the key's (LeRobot hands it on as `observation.state`),
-    and `return_so_far`, (1,) float32, the sum of this episode's rewards. Action: (1,) int64, one of `ACTIONS`; plain
+    and `return_so_far`, (1,) float32, the sum of this episode's rewards; with `obs_type="pixels_agent_pos"` also
+    `pixels`, whose `top` is `camera_picture`, (96, 96, 3) uint8. Action: (1,) int64, one of `ACTIONS`; plain
     integers and floats, which are rounded, do as well.
 
     An episode is truncated after `HORIZON` steps and never terminated. `info["is_success"]` is True from the step on
@@ -112,16 +116,18 @@ class DoorKeyEnv(gym.Env):
     task_description = TASK
     _max_episode_steps = HORIZON  # LeRobot reads it from the environment itself
 
-    def __init__(self, render_mode: str | None = "rgb_array") -> None:
+    def __init__(self, render_mode: str | None = "rgb_array", obs_type: str = "state") -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"DoorKey draws to arrays only: render_mode must be 'rgb_array', got {render_mode!r}.")
         self.render_mode = render_mode
-        self.observation_space = gym.spaces.Dict(
-            {
-                "agent_pos": gym.spaces.MultiDiscrete([len(CELLS), len(CELLS)]),
-                "return_so_far": gym.spaces.Box(-HORIZON, HORIZON, shape=(1,), dtype=np.float32),
-            }
-        )
+        self.obs_type = check_obs_type(obs_type)
+        spaces: dict[str, gym.Space] = {
+            "agent_pos": gym.spaces.MultiDiscrete([len(CELLS), len(CELLS)]),
+            "return_so_far": gym.spaces.Box(-HORIZON, HORIZON, shape=(1,), dtype=np.float32),
+        }
+        if obs_type != "state":
+            spaces["pixels"] = pixels_space(CAMERA_SHAPE)
+        self.observation_space = gym.spaces.Dict(spaces)
         self.action_space = gym.spaces.MultiDiscrete([len(ACTIONS)])  # (1,), so that a batch of them is (B, 1)
         self._grid = _DoorKeyGrid()
 
@@ -155,14 +161,24 @@ class DoorKeyEnv(gym.Env):
         """(192, 192, 3) uint8: the whole grid as MiniGrid draws it, without a display."""
         return self._grid.render()
 
+    def camera_picture(self) -> np.ndarray:
+        """(96, 96, 3) uint8: the whole grid, smaller."""
+        return self._grid.get_frame(highlight=False, tile_size=CAMERA_SHAPE[0] // (_SIZE + 2))
+
     @property
     def door_open(self) -> bool:
         """Whether the door has been opened; the expert acts on it, the observation does not show it."""
         return self._grid.door.is_open
 
-    def _observation(self) -> dict[str, np.ndarray]:
+    def _observation(self) -> dict[str, Any]:
         agent, key, _ = self._grid.state
-        return {"agent_pos": np.array([agent, key]), "return_so_far": np.array([self._return], dtype=np.float32)}
+        observation: dict[str, Any] = {
+            "agent_pos": np.array([agent, key]),
+            "return_so_far": np.array([self._return], dtype=np.float32),
+        }
+        if self.obs_type != "state":
+            observation["pixels"] = {"top": self.camera_picture()}
+        return observation
 
     def _start_cells(self, options: dict[str, Any]) -> list[int]:
         chosen = [options.get("agent"), options.get("key")]

@@ -8,6 +8,7 @@ Legend of shapes: N trajectories, K = 10 steps of the window, which is a whole e
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -80,7 +81,7 @@ class Panel:
     given: dict[str, list[int] | float]
     states: list[list[list[int]]]
     actions: list[list[int]]
-    achieved: dict[str, int | list[float] | list[bool]]
+    achieved: Mapping[str, Any]
     share: float | None = None
 
 

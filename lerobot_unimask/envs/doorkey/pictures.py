@@ -1,6 +1,7 @@
 """DoorKey: rooms, trajectories and predicted states, one square for each cell."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -128,11 +129,13 @@ def trajectories(
     colorbar = figure.colorbar(time, ax=row, shrink=0.7, aspect=16, pad=0.02, ticks=range(0, steps, 3))
     colorbar.set_label("step", fontsize=SMALL)
     colorbar.ax.tick_params(labelsize=SMALL, length=2)
-    *points, given = _trajectory_handles()
-    given = [] if cell is None else [Patch(fill=False, edgecolor=PURPLE, linewidth=2, label="the cell in question")]
+    points = _trajectory_handles()[:-1]
+    marked: list[Patch | Line2D] = (
+        [] if cell is None else [Patch(fill=False, edgecolor=PURPLE, linewidth=2, label="the cell in question")]
+    )
     columns = 7 if len(groups) > 2 else 3
     figure.legend(
-        handles=[*_grid_handles(), *points, *given],
+        handles=[*_grid_handles(), *points, *marked],
         loc="outside lower center",
         ncols=columns,
         fontsize=SMALL,
@@ -153,22 +156,32 @@ def _draw_trajectories(axes: Axes, states: np.ndarray, time: ScalarMappable) -> 
     for way in points:
         _draw_way(axes, way, time.to_rgba(np.arange(T)))
     key_x, key_y = coordinates(np.unique(states[:, 0, 1]))
-    style = {"color": ORANGE, "edgecolors": BLACK, "linewidths": 0.4}
+    style: dict[str, Any] = {"color": ORANGE, "edgecolors": BLACK, "linewidths": 0.4}
     axes.scatter(key_x + 0.25, key_y - 0.32, marker=KEY, s=130, zorder=5, **style)
 
 
 def _draw_way(axes: Axes, points: np.ndarray, colours: np.ndarray) -> None:
     """One trajectory through (T, 2) points, with an arrow wherever the agent moved."""
     segments = np.stack([points[:-1], points[1:]], axis=1)  # (T - 1, 2, 2)
-    axes.add_collection(LineCollection(segments, colors=colours[:-1], linewidths=1.5, zorder=2))
+    axes.add_collection(LineCollection(list(segments), colors=colours[:-1], linewidths=1.5, zorder=2))
     for (start, end), colour in zip(segments, colours[:-1], strict=True):
         move = end - start
         if np.hypot(*move) > 0.5:
-            style = {"arrowstyle": "-|>", "color": colour, "linewidth": 0, "mutation_scale": 9, "shrinkB": 0}
+            style: dict[str, Any] = {
+                "arrowstyle": "-|>",
+                "color": colour,
+                "linewidth": 0,
+                "mutation_scale": 9,
+                "shrinkB": 0,
+            }
             axes.annotate("", start + 0.66 * move, start + 0.2 * move, arrowprops=style, zorder=3)
-    axes.scatter(*points[1:-1].T, c=colours[1:-1], s=7, zorder=3)
-    axes.scatter(*points[0], marker="o", s=42, color=colours[0], edgecolors="white", linewidths=0.8, zorder=4)
-    axes.scatter(*points[-1], marker="s", s=38, color=colours[-1], edgecolors=BLACK, linewidths=0.8, zorder=4)
+    axes.scatter(points[1:-1, 0], points[1:-1, 1], c=colours[1:-1], s=7, zorder=3)
+    axes.scatter(
+        points[0, 0], points[0, 1], marker="o", s=42, color=colours[0], edgecolors="white", linewidths=0.8, zorder=4
+    )
+    axes.scatter(
+        points[-1, 0], points[-1, 1], marker="s", s=38, color=colours[-1], edgecolors=BLACK, linewidths=0.8, zorder=4
+    )
 
 
 def _draw_given(axes: Axes, panel: Panel, steps: int) -> None:
@@ -205,7 +218,7 @@ def _grid_handles() -> list[Patch | Line2D]:
 
 
 def _trajectory_handles() -> list[Patch | Line2D]:
-    point = {"linestyle": "none", "markersize": 6}
+    point: dict[str, Any] = {"linestyle": "none", "markersize": 6}
     return [
         _key_handle("key at the start"),
         Line2D([], [], marker="o", color=TIME(0.0), label="first state", **point),
@@ -215,7 +228,7 @@ def _trajectory_handles() -> list[Patch | Line2D]:
 
 
 def _key_handle(label: str) -> Line2D:
-    style = {"color": ORANGE, "markeredgecolor": BLACK, "markeredgewidth": 0.4, "markersize": 11}
+    style: dict[str, Any] = {"color": ORANGE, "markeredgecolor": BLACK, "markeredgewidth": 0.4, "markersize": 11}
     return Line2D([], [], marker=KEY, linestyle="none", label=label, **style)
 
 
@@ -272,5 +285,5 @@ def _draw_probabilities(axes: Axes, agent: np.ndarray, key: np.ndarray, probabil
                 x, y + 0.2, f"{agent[cell]:.2f}", fontsize=SMALL, ha="center", va="center", color=colour, zorder=3
             )
         if key[cell] >= LEAST:
-            style = {"color": ORANGE, "edgecolors": BLACK, "linewidths": 0.4, "alpha": float(key[cell])}
+            style: dict[str, Any] = {"color": ORANGE, "edgecolors": BLACK, "linewidths": 0.4, "alpha": float(key[cell])}
             axes.scatter(x, y - 0.25, marker=KEY, s=120, zorder=2, **style)

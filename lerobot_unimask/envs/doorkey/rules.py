@@ -16,6 +16,7 @@ is, and stepping on the key picks it up, so the agent carries it exactly when th
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,8 +39,8 @@ _WALL_X = 3  # the inner wall's column, which the door is in
 _DX, _DY = np.array([1, 0, -1, 0]), np.array([0, 1, 0, -1])  # of each action; y grows downwards
 
 
-def coordinates(cell: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """(x, y), each 1 to 4, of cells 0 to 15; any shape."""
+def coordinates(cell: ArrayLike) -> tuple[Any, Any]:
+    """(x, y), each 1 to 4, of cells 0 to 15: numbers, or arrays of any shape."""
     cell = np.asarray(cell)
     return cell % _SIZE + 1, cell // _SIZE + 1
 

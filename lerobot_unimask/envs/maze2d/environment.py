@@ -10,12 +10,14 @@ free space is the joint position (row - 0.2, column - 0.2). That is D4RL's quirk
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lerobot_unimask.envs.cameras import check_obs_type, pixels_space
 from lerobot_unimask.envs.maze2d.maze import (
     BODY_OFFSET,
     FPS,
@@ -32,7 +34,7 @@ from lerobot_unimask.envs.maze2d.maze import (
     Maze,
     parse_maze,
 )
-from lerobot_unimask.envs.maze2d.rendering import draw_maze
+from lerobot_unimask.envs.maze2d.rendering import camera_picture, draw_maze
 
 
 @lru_cache(maxsize=32)
@@ -72,9 +74,11 @@ class Maze2DEnv(gym.Env):
     """Push a point mass, whose velocity is hidden, to a goal: 200 steps of 0.01 s, one simulation step each.
 
     Observation: `agent_pos` float32 (4,): x, y, goal x, goal y (LeRobot's name for what becomes
-    `observation.state`), and `return_so_far` float32 (1,). Action: float32 (2,) in [-1, 1], the motors' forces;
-    values outside are clipped. Reward: by how much the distance to the goal shrank. An episode is truncated after
-    200 steps and never terminates; `info["is_success"]` says whether the mass has been within 0.5 of the goal.
+    `observation.state`), and `return_so_far` float32 (1,). With `obs_type="pixels_agent_pos"` also `pixels`, whose
+    `top` is `camera_picture`'s; with `hide_goal` `agent_pos` is x and y only. Action: float32 (2,) in [-1, 1], the
+    motors' forces; values outside are clipped. Reward: by how much the distance to the goal shrank. An episode is
+    truncated after 200 steps and never terminates; `info["is_success"]` says whether the mass has been within 0.5 of
+    the goal.
 
     `reset(options=...)` reads these keys and ignores others, LeRobot's among them:
         goal: (row, column) of a free cell.
@@ -92,17 +96,25 @@ class Maze2DEnv(gym.Env):
     task_description = TASK
     _max_episode_steps = HORIZON  # LeRobot reads it from the environment itself
 
-    def __init__(self, maze: str = "medium", render_mode: str | None = "rgb_array"):
+    def __init__(
+        self,
+        maze: str = "medium",
+        render_mode: str | None = "rgb_array",
+        obs_type: str = "state",
+        hide_goal: bool = False,
+    ):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Maze2D draws to arrays only: render_mode must be 'rgb_array', got {render_mode!r}.")
         self.maze = parse_maze(maze)
         self.render_mode = render_mode
-        self.observation_space = gym.spaces.Dict(
-            {
-                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (4,), np.float32),
-                "return_so_far": gym.spaces.Box(-np.inf, np.inf, (1,), np.float32),
-            }
-        )
+        self.obs_type, self.hide_goal = check_obs_type(obs_type), hide_goal
+        spaces: dict[str, gym.Space] = {
+            "agent_pos": gym.spaces.Box(-np.inf, np.inf, (2 if hide_goal else 4,), np.float32),
+            "return_so_far": gym.spaces.Box(-np.inf, np.inf, (1,), np.float32),
+        }
+        if obs_type != "state":
+            spaces["pixels"] = pixels_space(camera_picture(self.maze, (1, 1), (1, 1)).shape)
+        self.observation_space = gym.spaces.Dict(spaces)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self._model = compile_maze(self.maze)
         self._data = mujoco.MjData(self._model)
@@ -171,12 +183,15 @@ class Maze2DEnv(gym.Env):
         """The maze from above, uint8 (height, width, 3), both even."""
         return draw_maze(self.maze, self._goal, self._trail)
 
-    def _observation(self) -> dict[str, np.ndarray]:
-        return {
-            "agent_pos": np.array((*self._trail[-1], *self._goal), np.float32),
+    def _observation(self) -> dict[str, Any]:
+        observation: dict[str, Any] = {
+            "agent_pos": np.array((*self._trail[-1], *(() if self.hide_goal else self._goal)), np.float32),
             # The rewards' sum telescopes: no rounding error piles up.
             "return_so_far": np.array((self._start_distance - self._distance,), np.float32),
         }
+        if self.obs_type != "state":
+            observation["pixels"] = {"top": camera_picture(self.maze, self._goal, self._trail[-1])}
+        return observation
 
     def _draw_cell(self, other_than: Cell | None) -> Cell:
         cells = [cell for cell in self.maze.cells if cell != other_than]

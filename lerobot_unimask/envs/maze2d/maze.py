@@ -34,6 +34,8 @@ WALL_OFFSET = 1.0  # where the box of cell 0 stands
 
 MASS_RADIUS = 0.1
 
+CAMERA_PIXELS_PER_CELL = 14  # the smallest maze, of 5 cells, is as large as LeRobot's video codec needs
+
 MAZES = {
     "umaze": """\
 #####

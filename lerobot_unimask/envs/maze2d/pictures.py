@@ -1,5 +1,7 @@
 """Maze2D: where the model thinks the mass is, over the maze's walls."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -85,7 +87,13 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
     ]
     if scale is not None:
         handles.append(Patch(facecolor=BLUE, alpha=0.25, label="two scales around it"))
-    style = {"marker": "s", "linestyle": "none", "markersize": 6, "markerfacecolor": "none", "color": PURPLE}
+    style: dict[str, Any] = {
+        "marker": "s",
+        "linestyle": "none",
+        "markersize": 6,
+        "markerfacecolor": "none",
+        "color": PURPLE,
+    }
     handles.append(Line2D([], [], label="shown", **style))
     if recorded is not None:
         handles.append(Line2D([], [], color=VERMILLION, linewidth=1.2, label="recorded"))

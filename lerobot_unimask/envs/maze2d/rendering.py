@@ -13,7 +13,15 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lerobot_unimask.envs.maze2d.maze import BODY_OFFSET, MASS_RADIUS, SUCCESS_DISTANCE, WALL_OFFSET, Cell, Maze
+from lerobot_unimask.envs.maze2d.maze import (
+    BODY_OFFSET,
+    CAMERA_PIXELS_PER_CELL,
+    MASS_RADIUS,
+    SUCCESS_DISTANCE,
+    WALL_OFFSET,
+    Cell,
+    Maze,
+)
 
 PIXELS_PER_CELL = 48  # times any number of cells it is a multiple of 16, which suits video codecs
 
@@ -48,6 +56,41 @@ def draw_maze(maze: Maze, goal: Cell, trail: Sequence[tuple[float, float]]) -> n
         draw.line((*points[i - 1], *points[i]), fill=colour, width=3 * SMOOTHING)
     _draw_disc(draw, trail[-1], MASS_RADIUS, MASS_COLOUR)
     return np.asarray(image.reduce(SMOOTHING))
+
+
+CAMERA_GOAL, CAMERA_MASS = 0.4, 0.2  # radii of the discs, in cells: they are seen in small pictures too
+
+
+def camera_picture(maze: Maze, goal: Cell, position: tuple[float, float]) -> np.ndarray:
+    """What a camera above the maze sees: walls, goal and mass, and of the way that the mass came nothing.
+
+    Returns:
+        uint8 (14 rows, 14 columns, 3).
+    """
+    picture = _camera_walls(maze).copy()
+    for place, radius, colour in ((goal, CAMERA_GOAL, GOAL_COLOUR), (position, CAMERA_MASS, MASS_COLOUR)):
+        _blend_disc(picture, place, radius, colour)
+    return picture.astype(np.uint8)
+
+
+@lru_cache(maxsize=32)
+def _camera_walls(maze: Maze) -> np.ndarray:
+    walls = np.array([[cell == "#" for cell in row] for row in maze.rows])
+    walls = walls.repeat(CAMERA_PIXELS_PER_CELL, axis=0).repeat(CAMERA_PIXELS_PER_CELL, axis=1)
+    return np.where(walls[..., None], WALL_COLOUR, FLOOR_COLOUR).astype(np.float32)
+
+
+def _blend_disc(picture: np.ndarray, place: tuple[float, float], radius: float, colour: tuple[int, ...]) -> None:
+    """Draw a disc with smooth edges over a picture, (height, width, 3) float32, in place."""
+    x, y = ((part + BODY_OFFSET - WALL_OFFSET + 0.5) * CAMERA_PIXELS_PER_CELL for part in place)
+    reach = radius * CAMERA_PIXELS_PER_CELL
+    rows = slice(max(0, int(x - reach - 1)), max(0, int(x + reach + 2)))
+    columns = slice(max(0, int(y - reach - 1)), max(0, int(y + reach + 2)))
+    part = picture[rows, columns]  # a view
+    down = np.arange(rows.start, rows.start + part.shape[0])[:, None] + 0.5 - x
+    right = np.arange(columns.start, columns.start + part.shape[1]) + 0.5 - y
+    share = np.clip(reach + 0.5 - np.hypot(down, right), 0, 1)[..., None]
+    part += share * (np.array(colour, np.float32) - part)
 
 
 def _to_pixels(position: tuple[float, float]) -> tuple[float, float]:

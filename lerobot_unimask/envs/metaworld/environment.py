@@ -40,7 +40,7 @@ def load_metaworld() -> Any:
         for i in np.flatnonzero(self.model.eq_type == mujoco.mjtEq.mjEQ_WELD):
             self.model.eq_data[i, : len(weld)] = weld
 
-    SawyerMocapBase.reset_mocap_welds = reset_mocap_welds
+    setattr(SawyerMocapBase, "reset_mocap_welds", reset_mocap_welds)  # noqa: B010 (a type checker reads it so)
     return metaworld
 
 
@@ -92,7 +92,7 @@ class MetaWorldEnv(gym.Env):
         self.arm.reset()
         self.objects = objects or len(self.arm._get_pos_objects()) // 3
         self.numbers = OBJECT * self.objects + 3
-        unbounded = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
+        unbounded: dict[str, Any] = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
         self.observation_space = gym.spaces.Dict(
             {
                 "agent_pos": gym.spaces.Box(shape=(HAND,), **unbounded),

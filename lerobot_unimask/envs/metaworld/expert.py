@@ -24,7 +24,8 @@ def make_expert(task: str) -> Any:
     load_metaworld()
     from metaworld.policies import ENV_POLICY_MAP
 
-    return ENV_POLICY_MAP[task]()
+    policies: dict[str, Any] = ENV_POLICY_MAP
+    return policies[task]()
 
 
 def demonstrate(env: MetaWorldEnv, expert: Any, noise: float, rng: np.random.Generator) -> Demonstration | None:
