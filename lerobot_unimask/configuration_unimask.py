@@ -4,6 +4,7 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -48,11 +49,11 @@ NETWORKS = {
 }
 TOKEN_LAYOUTS = ("stacked", "separate")
 DISCRETE_HEADS = ("joint", "separate")
-CONTINUOUS_HEADS = ("l2", "gaussian")
+CONTINUOUS_HEADS = ("l2", "gaussian", "mixture")
 UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
 FINE_FROM = 500  # episodes; fewer are learnt by heart from sines and cosines (docs/arm.md)
 # More is a damaged file, or a slip
-MOST = {"width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
+MOST = {"mixture_components": 64, "width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
 
 
 class FormatVersion(int):
@@ -146,8 +147,11 @@ class UniMASKConfig(PreTrainedConfig):
     categories, where there are at most 1,024, or "separate", the paper's: one for each number. None: joint; in a
     checkpoint of format 2 or older, separate."""
     continuous_head: str = "gaussian"
-    """What is predicted of continuous values: "gaussian", a mean and a scale, or "l2", the paper's: a mean by the
-    squared error, which hardly notices what is nearly certain, such as states some steps ahead."""
+    """What is predicted of continuous values: "gaussian", a mean and a scale for each number; "mixture", several
+    Gaussians over all of a token's numbers together, for futures that fork; or "l2", the paper's: a mean by the squared
+    error, which hardly notices what is nearly certain, such as states some steps ahead."""
+    mixture_components: int = 5
+    """Number of Gaussians, with continuous_head=mixture."""
     width: int = 128
     """Numbers that stand for a token inside the network."""
     depth: int = 3
@@ -292,9 +296,8 @@ class UniMASKConfig(PreTrainedConfig):
 
     def make_factors(self) -> dict[str, Factor]:
         """The model's factors, and how the heads predict them."""
-        return make_factors(
-            self.features, joint=self.discrete_head == "joint", gaussian=self.continuous_head == "gaussian"
-        )
+        gaussians = {"l2": 0, "gaussian": 1, "mixture": self.mixture_components}[self.continuous_head]
+        return make_factors(self.features, joint=self.discrete_head == "joint", gaussians=gaussians)
 
     # LeRobot's contract
 
@@ -430,3 +433,11 @@ def read_config(folder: Path) -> UniMASKConfig:
         hidden = isinstance(error, ParsingError) and not isinstance(error, DecodingError)
         reason = error.__cause__ if hidden else error
         raise ValueError(f"{path} cannot be read: {str(reason)[:1000]}") from error
+
+
+def saved_factors(config: UniMASKConfig, folder: Path) -> dict[str, Factor]:
+    """The factors as a checkpoint's own heads predict them: the config that it is read with may say joint where it has
+    separate ones."""
+    saved = copy(config)
+    saved.discrete_head = read_config(folder).discrete_head
+    return saved.make_factors()

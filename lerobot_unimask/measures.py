@@ -13,7 +13,9 @@ from typing import Any
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
+from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
 
+from lerobot_unimask.asking.answers import ContinuousDistribution
 from lerobot_unimask.asking.answers import answer as answer_question
 from lerobot_unimask.data.checkpoints import episodes_trained_on
 from lerobot_unimask.data.episodes import bounds_of, read_windows
@@ -22,6 +24,8 @@ from lerobot_unimask.language.masks import Mask, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
 logger = logging.getLogger(__name__)
+
+DRAWS = 200  # that a divergence of mixtures is taken over
 
 EVERY = 7  # steps between the windows that are read
 
@@ -45,7 +49,8 @@ def error_ahead(policy: UniMASKPolicy, batch: dict[str, Tensor], ahead: int) -> 
     it, how far one gets by repeating the last displacement as often.
 
     Returns:
-        Mean Euclidean distances in the dataset's units, and the number of windows.
+        Mean Euclidean distances in the dataset's units, and the number of windows; but for an L2 head also the mean
+        logarithm of the true state's density, in nats.
 
     Raises:
         ValueError: states that are not continuous, or a window that is too short.
@@ -59,12 +64,16 @@ def error_ahead(policy: UniMASKPolicy, batch: dict[str, Tensor], ahead: int) -> 
     states = policy.make_window(batch).values["s"]  # (B, K, D)
     truth = states[:, now + ahead]
     repeated = states[:, now] + ahead * (states[:, now] - states[:, now - 1])
-    return {
+    found = {
         "steps": ahead,
         "model": (answer.most_likely("s")[:, now + ahead] - truth).norm(dim=-1).mean().item(),
         "last_displacement_repeated": (repeated - truth).norm(dim=-1).mean().item(),
         "windows": len(truth),
     }
+    if policy.config.continuous_head != "l2":
+        parts = (part for part in answer.distributions["s"] if isinstance(part, ContinuousDistribution))
+        found["log_density"] = sum(part.log_density(states)[:, now + ahead].mean().item() for part in parts)
+    return found
 
 
 @torch.no_grad()
@@ -102,15 +111,26 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
 
 
 def _divergence(p: Tensor, q: Tensor, output: Output) -> Tensor:
-    """(B, size) of two networks' outputs -> (B,)"""
+    """(B, size) of two networks' outputs -> (B,); of mixtures, that of draws, for it has no closed form."""
     if output.discrete:
         p, q = p.log_softmax(-1), q.log_softmax(-1)
         return (p.exp() * (p - q)).sum(-1)
-    if not output.gaussian:
+    if not output.gaussians:
         return (p - q).square().sum(-1) / 2
+    if output.gaussians > 1:
+        one, other = _mixture(p, output), _mixture(q, output)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            drawn = one.sample((DRAWS,))
+        return (one.log_prob(drawn) - other.log_prob(drawn)).mean(0)
     (mean_p, scale_p), (mean_q, scale_q) = p.chunk(2, dim=-1), q.chunk(2, dim=-1)
     apart = (2 * (scale_p - scale_q)).exp() + ((mean_p - mean_q) * (-scale_q).exp()).square()
     return (scale_q - scale_p + apart / 2 - 0.5).sum(-1)
+
+
+def _mixture(prediction: Tensor, output: Output) -> MixtureSameFamily:
+    logits, means, scales = output.unpack(prediction)
+    return MixtureSameFamily(Categorical(logits=logits), Independent(Normal(means, scales.exp()), 1))
 
 
 def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> dict[str, float]:

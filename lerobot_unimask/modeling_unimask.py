@@ -25,7 +25,7 @@ from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.predicting import predict
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
-from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config
+from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config, saved_factors
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, read_weights
 from lerobot_unimask.data.factors import TASK
 from lerobot_unimask.data.returns import EpisodeStarts
@@ -36,7 +36,7 @@ from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
 from lerobot_unimask.machine import keep_freed_memory
 from lerobot_unimask.networks import make_network
-from lerobot_unimask.networks.layers import Cache, Predictions
+from lerobot_unimask.networks.layers import Cache, Predictions, joined
 from lerobot_unimask.networks.losses import LossParts
 from lerobot_unimask.networks.vision import parameter_groups
 from lerobot_unimask.objective import CapturedLoss, batch_loss
@@ -341,7 +341,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         config = config or read_config(folder)
         config.validate_features()
         with torch.device("meta"):
-            network = make_network(config, config.make_factors(), load_backbone=False)
+            network = make_network(config, saved_factors(config, folder), load_backbone=False)
         check_header(folder / WEIGHTS, network.state_dict(prefix="network."))
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)
@@ -412,10 +412,12 @@ class UniMASKPolicy(PreTrainedPolicy):
     def _load_as_safetensor(
         cls, model: "UniMASKPolicy", model_file: str, map_location: str, strict: bool
     ) -> "UniMASKPolicy":
-        """Strictly, whatever `strict` says: LeRobot never passes it, and a partly loaded model answers nonsense."""
+        """Strictly, whatever `strict` says: LeRobot never passes it, and a partly loaded model answers nonsense.
+        Separate heads become joint ones where the config says so."""
         weights = read_weights(Path(model_file))
         if weights.get("episode_starts.returns", torch.empty(())).ndim == 1:
             model.episode_starts.make_room(len(weights["episode_starts.returns"]))
+        weights |= joined(weights, saved_factors(model.config, Path(model_file).parent), model.factors)
         check_weights(weights, model.state_dict(), model_file)
         model.load_state_dict(weights)
         return model

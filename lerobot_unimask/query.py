@@ -184,8 +184,9 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
     """The answer token by token in the order of time, one row for each number of a token.
 
     Marginals have `most_likely`, its `probability` and all `probabilities`, or `mean` and `scale` (None from an L2
-    head); samples `most_frequent`, its `share` and all `shares`, or `mean` and `scale` over the samples. `recorded` is
-    None where nothing is. `exact` has the optimum's marginal, where that was asked for.
+    head), and of a mixture the `weights`, `means` and `scales` of its Gaussians; samples `most_frequent`, its `share`
+    and all `shares`, or `mean` and `scale` over the samples. `recorded` is None where nothing is. `exact` has the
+    optimum's marginal, where that was asked for.
     """
     K = policy.config.context_length
     table = []
@@ -214,7 +215,11 @@ def _of_marginals(answer: Answer, name: str, step: int, i: int) -> dict[str, Any
     if isinstance(distribution, ContinuousDistribution):
         at = i - distribution.component.dims.start
         scale = None if distribution.scale is None else distribution.scale[0, step, at].item()
-        return {"mean": distribution.mean[0, step, at].item(), "scale": scale}
+        said = {"mean": distribution.mean[0, step, at].item(), "scale": scale}
+        if distribution.output.gaussians > 1:
+            means, scales = (part[0, step, :, at].tolist() for part in (distribution.means, distribution.scales))
+            said |= {"weights": distribution.weights[0, step].tolist(), "means": means, "scales": scales}
+        return said
     probabilities = distribution.probabilities[0, step]
     best = int(probabilities.argmax())
     return {"most_likely": best, "probability": probabilities[best].item(), "probabilities": probabilities.tolist()}

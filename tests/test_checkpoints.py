@@ -287,6 +287,18 @@ def test_a_checkpoint_of_format_2_predicts_a_tokens_numbers_separately(tiny_poli
     assert [output.size for output in tiny_policy().factors["s"].outputs] == [256]
 
 
+@pytest.mark.parametrize("network", ["transformer", "feedforward"])
+def test_separate_heads_go_on_as_joint_ones_that_answer_the_same(network, tiny_policy, doorkey_batch, tmp_path):
+    policy = tiny_policy(discrete_head="separate", network=network)
+    policy.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.discrete_head = "joint"
+    loaded = UniMASKPolicy.from_pretrained(tmp_path, config=config).eval()
+    assert [output.size for output in loaded.factors["s"].outputs] == [256]
+    window, mask = random_question(policy, doorkey_batch, 0)
+    assert_same_answers(loaded.infer(window, mask), policy.infer(window, mask), exactly=False)
+
+
 def test_another_kind_of_policy_is_named(tmp_path):
     (tmp_path / "config.json").write_text('{"type": "act"}')
     with pytest.raises(ValueError, match="type 'act'"):

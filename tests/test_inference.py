@@ -318,7 +318,7 @@ def test_continuous_answers_are_in_the_datasets_units():
 
 def test_a_gaussian_head_answers_with_a_mean_and_a_scale():
     features = {"s": [Feature("observation.state", 1)], "a": [Feature("action", 1)]}
-    factors = make_factors(features, gaussian=True)
+    factors = make_factors(features, gaussians=1)
     statistics = Statistics(features, factors, 3)
     statistics.fill({"observation.state": {"mean": [10.0], "std": [2.0]}, "action": {"mean": [0.0], "std": [1.0]}})
     B = 4000
@@ -340,6 +340,73 @@ def test_a_gaussian_head_answers_with_a_mean_and_a_scale():
     assert drawn[:, 2].isnan().all()
     assert drawn[:, 1].mean().item() == pytest.approx(12, abs=5 * scale / B**0.5)
     assert drawn[:, 1].std().item() == pytest.approx(scale, rel=5 / (2 * B) ** 0.5)
+
+
+def mixture_answer(B=1):
+    """Of a state of three numbers in two columns: two narrow forks, and a wide hill with most of the weight."""
+    features = {"s": [Feature("s", 2), Feature("z", 1)], "a": [Feature("a", 1)]}
+    factors = make_factors(features, gaussians=3)
+    statistics = Statistics(features, factors, 2)
+    statistics.fill({key: {"mean": [1.0] * n, "std": [2.0] * n} for key, n in (("s", 2), ("z", 1), ("a", 1))})
+    weights = torch.tensor([0.3, 0.2, 0.5])
+    means = torch.tensor([[-2.0, -2.0, 0.0], [2.0, 2.0, 1.0], [0.0, 0.0, 0.0]])
+    scales = torch.tensor([[0.2, 0.2, 0.3], [0.2, 0.2, 0.3], [1.0, 1.0, 1.0]])
+    (output,) = factors["s"].outputs
+    prediction = output.pack(weights.log(), means, scales.log())
+    other = torch.zeros(B, 2, factors["a"].outputs[0].size)
+
+    def network(window, mask, cache=None):
+        return {"s": [prediction.expand(B, 2, -1)], "a": [other]}
+
+    window = Window({"s": torch.full((B, 2, 3), 7.0), "a": torch.zeros(B, 2, 1)}, torch.ones(B, 2).bool())
+    mask = tabulate("s[1] | s[0]", ("s", "a"), 2).at(None, B)
+    return answer(model(network, statistics, factors), window, mask), weights, 1 + 2 * means, 2 * scales
+
+
+def test_a_mixture_answers_with_weights_means_and_scales():
+    said, weights, means, scales = mixture_answer()
+    (joint,) = said.distributions["s"]
+    for found, expected in ((joint.weights, weights), (joint.means, means), (joint.scales, scales)):
+        torch.testing.assert_close(found[0, 1], expected)
+    assert said.most_likely("s")[0, 0].tolist() == [7, 7, 7]  # shown
+    assert joint.scale[0, 0].tolist() == [0, 0, 0]
+    assert said["a"][0].mean.isnan().all()
+    two, one = said["s"]
+    assert (two.name, one.name) == ("s", "z")
+    torch.testing.assert_close(two.means[0, 1], means[:, :2])
+    torch.testing.assert_close(one.scales[0, 1], scales[:, 2:])
+
+
+def test_a_mixtures_draws_have_its_moments_and_keep_numbers_together():
+    B = 6000
+    said, weights, means, _ = mixture_answer(B)
+    drawn = said.draw("s", torch.Generator().manual_seed(0))
+    assert (drawn[:, 0] == 7).all()
+    drawn, (joint,) = drawn[:, 1], said.distributions["s"]
+    torch.testing.assert_close(drawn.mean(0), joint.mean[0, 1], atol=0.15, rtol=0)
+    torch.testing.assert_close(drawn.std(0), joint.scale[0, 1], atol=0.1, rtol=0)
+    assert ((drawn[:, 0] < -2) & (drawn[:, 1] > 4)).float().mean() < 0.01  # either fork has both numbers
+    for fork, weight in ((means[0], weights[0]), (means[1], weights[1])):
+        near = ((drawn - fork).abs() < 3 * 0.6).all(-1).float().mean()
+        assert near == pytest.approx(weight.item(), abs=0.06)
+
+
+def test_a_mixtures_most_likely_value_is_its_highest_mode():
+    """By a fine grid, of a mixture whose modes are no Gaussian's mean."""
+    said, *_ = mixture_answer()
+    (joint,) = said.distributions["s"]
+    joint.scales = joint.scales * torch.tensor([1.0, 1.0, 0.2]).view(3, 1) + torch.tensor([1.0, 1.2, 0.0]).view(3, 1)
+    axis = torch.linspace(-6, 8, 57)
+    grid = torch.cartesian_prod(axis, axis, axis).view(1, -1, 1, 3)
+    density = joint.log_density(grid.view(-1, 1, 3).expand(-1, 2, 3))[:, 1]
+    mixture = torch.distributions.MixtureSameFamily(
+        torch.distributions.Categorical(joint.weights[0, 1]),
+        torch.distributions.Independent(torch.distributions.Normal(joint.means[0, 1], joint.scales[0, 1]), 1),
+    )
+    torch.testing.assert_close(density, mixture.log_prob(grid.view(-1, 3)))
+    best = grid.view(-1, 3)[density.argmax()]
+    torch.testing.assert_close(joint.most_likely[0, 1], best, atol=0.25, rtol=0)
+    assert mixture.log_prob(joint.most_likely[0, 1]) >= density.max()
 
 
 # --- Values that a user gives ----------------------------------------------------------------------------------------

@@ -55,20 +55,25 @@ def slow_losses(predictions, window, asked, factors):
                     if output.discrete:
                         combinations = list(itertools.product(*map(range, output.categories)))
                         cost = math.log(sum(math.exp(n) for n in numbers)) - numbers[combinations.index(tuple(target))]
-                    elif output.gaussian:
-                        means, logarithms = numbers[: len(target)], numbers[len(target) :]
-                        densities = [
-                            math.exp(-(((v - m) / math.exp(s)) ** 2) / 2) / math.sqrt(2 * math.pi) / math.exp(s)
-                            for m, s, v in zip(means, logarithms, target, strict=True)
-                        ]
-                        cost = -sum(map(math.log, densities)) / len(target)
+                    elif output.gaussians:
+                        n, d = output.gaussians, len(target)
+                        logits = numbers[:n] if n > 1 else [0.0]
+                        means, logarithms = (numbers[len(numbers) - k * n * d :][: n * d] for k in (2, 1))
+                        density = 0.0
+                        for i in range(n):
+                            part = math.exp(logits[i]) / sum(map(math.exp, logits))
+                            for v, m, s in zip(target, means[i * d :][:d], logarithms[i * d :][:d], strict=True):
+                                part *= math.exp(-(((v - m) / math.exp(s)) ** 2) / 2)
+                                part /= math.sqrt(2 * math.pi) * math.exp(s)
+                            density += part
+                        cost = -math.log(density) / d
                     else:
                         cost = sum((n - v) ** 2 for n, v in zip(numbers, target, strict=True)) / len(target)
                     losses[name] += cost / count
     return losses
 
 
-@pytest.mark.parametrize("how", [{}, {"gaussian": True}, {"joint": True}, {"joint": True, "gaussian": True}])
+@pytest.mark.parametrize("how", [{}, {"gaussians": 1}, {"joint": True}, {"joint": True, "gaussians": 3}])
 def test_the_loss_is_that_of_a_loop_over_tokens(how):
     factors = make_factors(FEATURES, **how)
     question = make_question(factors)
@@ -97,7 +102,7 @@ def test_a_joint_predictions_marginals_cost_what_tables_say():
 
 
 def test_a_gaussians_scale_is_bounded():
-    output = make_factors(FEATURES, gaussian=True)["a"].outputs[0]
+    output = make_factors(FEATURES, gaussians=1)["a"].outputs[0]
     value = torch.tensor([[[1.0, -1.0]]])
     for log_scale in (-1e6, 1e6):
         prediction = torch.tensor([[[1.0, -1.0, log_scale, log_scale]]], requires_grad=True)
@@ -108,7 +113,7 @@ def test_a_gaussians_scale_is_bounded():
 
 
 def test_a_gaussians_gradient_is_that_of_its_likelihood_times_its_scale():
-    output = make_factors(FEATURES, gaussian=True)["a"].outputs[0]
+    output = make_factors(FEATURES, gaussians=1)["a"].outputs[0]
     generator = torch.Generator().manual_seed(0)
     value = torch.randn(B, K, 2, generator=generator)
     mean, log_scale = (torch.randn(B, K, 2, generator=generator).requires_grad_() for _ in range(2))
@@ -118,6 +123,21 @@ def test_a_gaussians_gradient_is_that_of_its_likelihood_times_its_scale():
         (mean, log_scale), torch.autograd.grad(-density.sum(), (mean, log_scale)), strict=True
     ):
         torch.testing.assert_close(numbers.grad, gradient * log_scale.detach().exp())
+
+
+def test_a_mixtures_gradient_is_that_of_its_likelihood_times_scales_and_of_its_weights_as_it_is():
+    output = make_factors(FEATURES, gaussians=3)["a"].outputs[0]
+    generator = torch.Generator().manual_seed(0)
+    value = torch.randn(B, K, 2, generator=generator)
+    logits = torch.randn(B, K, 3, generator=generator).requires_grad_()
+    means, scales = (torch.randn(B, K, 3, 2, generator=generator).requires_grad_() for _ in range(2))
+    output_loss(output.pack(logits, means, scales), value, output).sum().backward()
+    normals = torch.distributions.Independent(torch.distributions.Normal(means, scales.exp()), 1)
+    mixture = torch.distributions.MixtureSameFamily(torch.distributions.Categorical(logits=logits), normals)
+    expected = torch.autograd.grad(-mixture.log_prob(value).sum() / 2, (logits, means, scales))
+    torch.testing.assert_close(logits.grad, expected[0])
+    for parameter, gradient in zip((means, scales), expected[1:], strict=True):
+        torch.testing.assert_close(parameter.grad, gradient * scales.detach().exp())
 
 
 def test_a_perfect_prediction_costs_nothing():

@@ -89,7 +89,7 @@ def test_divergences_are_those_of_torch():
     p, q = torch.randn(2, 20, 4)
     categorical = _divergence(p, q, Output((Component("a", slice(0, 1), 4),)))
     torch.testing.assert_close(categorical, kl_divergence(Categorical(logits=p), Categorical(logits=q)))
-    gaussian = _divergence(p, q, Output((Component("a", slice(0, 2), None),), gaussian=True))
+    gaussian = _divergence(p, q, Output((Component("a", slice(0, 2), None),), gaussians=1))
     normals = [Normal(x[:, :2], x[:, 2:].exp()) for x in (p, q)]
     torch.testing.assert_close(gaussian, kl_divergence(*normals).sum(-1))
     unit = _divergence(p, q, Output((Component("a", slice(0, 4), None),)))

@@ -259,6 +259,36 @@ def test_a_network_learns_what_a_mask_hides(network, settings):
     assert torch.equal(network(window, shown)["s"][0].argmax(-1)[:, 1:], states[:, 1:, 0].long())
 
 
+def test_a_mixture_learns_a_fork_where_one_gaussian_points_between():
+    """From the start the way goes to (1, 1) or (-1, -1), as often: the loss against the entropy."""
+    scale, count = 0.1, 128
+    generator = torch.Generator().manual_seed(0)
+    side = torch.randint(0, 2, (count, 1, 1), generator=generator) * 2.0 - 1
+    states = side * torch.tensor([0.0, 1.0]).view(1, 2, 1) + scale * torch.randn(count, 2, 2, generator=generator)
+    window = Window({"s": states, "a": torch.zeros(count, 2, 1)}, torch.ones(count, 2, dtype=torch.bool))
+    first = (torch.arange(2) == 0).expand(count, 2)
+    shown, asked = {"s": first, "a": first & False}, {"s": ~first, "a": first & False}
+    lowest = math.log(2) / 2 + math.log(scale) + 0.5 * math.log(2 * math.pi * math.e)  # in nats for each number
+    losses = {}
+    for gaussians in (1, 3):
+        torch.manual_seed(0)
+        factors = make_factors(
+            {"s": [Feature("observation.state", 2)], "a": [Feature("action", 1)]}, gaussians=gaussians
+        )
+        network = FeedForward(
+            factors, context_length=2, fine_inputs=False, width=8, depth=1, feedforward_width=32, dropout=0.0
+        )
+        optimiser = torch.optim.Adam(network.parameters(), lr=2e-2)
+        for _ in range(200):
+            loss = masked_losses(network(window, shown), window, asked, factors)["s"]
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        losses[gaussians] = loss.item()
+    assert losses[3] < lowest + 0.1
+    assert losses[1] > lowest + 1
+
+
 # --- Causal attention ------------------------------------------------------------------------------------------------
 
 

@@ -170,9 +170,9 @@ def test_normalising_and_back_is_the_identity():
     for name, factor in make_factors(FEATURES).items():
         for output in factor.outputs:
             value = normalised.values[name][..., output.numbers]
-            back, scale = statistics.denormalise(name, output, value)
+            _, back, scale = statistics.denormalise(name, output, value)
             assert scale is None
-            torch.testing.assert_close(back, window.values[name][..., output.numbers])
+            torch.testing.assert_close(back[..., 0, :], window.values[name][..., output.numbers])
             if output.discrete:
                 assert torch.equal(value, window.values[name][..., output.numbers])
 
@@ -180,12 +180,13 @@ def test_normalising_and_back_is_the_identity():
 def test_a_gaussians_scale_is_in_the_datasets_units():
     statistics = make_statistics()
     statistics.fill(STATS)
-    output = make_factors(FEATURES, gaussian=True)["s"].outputs[-1]
+    output = make_factors(FEATURES, gaussians=1)["s"].outputs[-1]
     assert output.size == 6
     prediction = torch.tensor([0.0, 1.0, 2.0, 0.0, torch.tensor(3.0).log(), 0.0])
-    mean, scale = statistics.denormalise("s", output, prediction)
-    torch.testing.assert_close(mean, torch.tensor([1.0, -10.0, 7.0]))
-    torch.testing.assert_close(scale, torch.tensor([0.5, 30.0, 1.0]))
+    weight, mean, scale = statistics.denormalise("s", output, prediction)
+    assert weight.tolist() == [1]
+    torch.testing.assert_close(mean, torch.tensor([[1.0, -10.0, 7.0]]))
+    torch.testing.assert_close(scale, torch.tensor([[0.5, 30.0, 1.0]]))
 
 
 def test_statistics_are_kept_with_the_weights():

@@ -5,6 +5,7 @@ Acting and sampling are questions too, so everything here goes through `answer`;
 Legend of shapes: B windows, K steps, D the numbers of a factor, d those of one of its components.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -28,6 +29,9 @@ class Model(Protocol):
     def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
         """A network's outputs for a window of normalised values."""
         ...
+
+
+CLIMBS = 20  # steps from a Gaussian's mean to a mixture's mode
 
 
 @dataclass
@@ -85,16 +89,19 @@ class DiscreteDistribution:
 
 @dataclass
 class ContinuousDistribution:
-    """The answer about one continuous component at every step; shown and hidden tokens as in `DiscreteDistribution`.
+    """The answer about continuous components at every step, as n Gaussians; shown and hidden tokens as in
+    `DiscreteDistribution`.
 
     Attributes:
-        mean: (B, K, d)
-        scale: (B, K, d), standard deviation: 0 where shown; None from an L2 head, which has none.
+        weights: (B, K, n), that add up to 1.
+        means: (B, K, n, d)
+        scales: (B, K, n, d), standard deviations: 0 where shown; None from an L2 head, which has none.
     """
 
     output: Output
-    mean: Tensor
-    scale: Tensor | None
+    weights: Tensor
+    means: Tensor
+    scales: Tensor | None
 
     @property
     def component(self) -> Component:
@@ -105,25 +112,71 @@ class ContinuousDistribution:
         return self.component.name
 
     @property
+    def mean(self) -> Tensor:
+        """(B, K, d), over all Gaussians."""
+        if self.means.shape[-2] == 1:
+            return self.means[..., 0, :]
+        return (self.weights.unsqueeze(-1) * self.means).sum(-2)
+
+    @property
+    def scale(self) -> Tensor | None:
+        """(B, K, d), the standard deviation over all Gaussians."""
+        if self.scales is None or self.means.shape[-2] == 1:
+            return None if self.scales is None else self.scales[..., 0, :]
+        apart = (self.means - self.mean.unsqueeze(-2)).square() + self.scales.square()
+        return (self.weights.unsqueeze(-1) * apart).sum(-2).sqrt()
+
+    @property
     def most_likely(self) -> Tensor:
-        """(B, K, d): the mean."""
-        return self.mean
+        """(B, K, d): the mean of a single Gaussian; of several the highest mode, to which the mean of each climbs by
+        the fixed point of Carreira-Perpinan ("Mode-finding for mixtures of Gaussian distributions", 2000)."""
+        if self.scales is None or self.means.shape[-2] == 1:
+            return self.mean
+        x = self.means  # (B, K, n, d), one start for each
+        precise = self.scales.clamp_min(1e-12).square().reciprocal().unsqueeze(-3)  # (B, K, 1, n, d)
+        for _ in range(CLIMBS):
+            share = self._log_densities(x).softmax(-1).unsqueeze(-1) * precise  # (B, K, n, n, d)
+            x = (share * self.means.unsqueeze(-3)).sum(-2) / share.sum(-2)
+        height = self._log_densities(x).logsumexp(-1)  # (B, K, n)
+        best = height.nan_to_num(-torch.inf).argmax(-1, keepdim=True).unsqueeze(-1)
+        return torch.where((self.weights[..., :1] == 1), self.mean, x.take_along_dim(best, -2)[..., 0, :])
+
+    def _log_densities(self, x: Tensor) -> Tensor:
+        """Those of each Gaussian, times its weight, at m places for each step: (B, K, m, d) -> (B, K, m, n)."""
+        scales = self.scales.clamp_min(1e-12)
+        surprise = (x.unsqueeze(-2) - self.means.unsqueeze(-3)) / scales.unsqueeze(-3)
+        logs = -(surprise.square() / 2 + math.log(2 * math.pi) / 2 + scales.log().unsqueeze(-3)).sum(-1)
+        return logs + self.weights.log().unsqueeze(-2)
+
+    def log_density(self, values: Tensor) -> Tensor:
+        """That of the values of tokens, in nats and the dataset's units: (B, K, D) -> (B, K)."""
+        return self._log_densities(values[..., self.output.numbers].unsqueeze(-2)).logsumexp(-1)[..., 0]
 
     def marginals(self) -> "list[ContinuousDistribution]":
         """One for each component."""
-        return [self]
+        if len(self.output.components) == 1:
+            return [self]
+        sizes = [len(part.numbers) for part in self.output.apart]
+        pairs = zip(self.output.apart, self.means.split(sizes, -1), self.scales.split(sizes, -1), strict=True)
+        return [ContinuousDistribution(part, self.weights, *of_numbers) for part, *of_numbers in pairs]
 
     def at(self, rows: Tensor, step: int) -> "ContinuousDistribution":
-        """That of some windows, (n,) their numbers, at one step: (n, 1, d)."""
-        scale = None if self.scale is None else self.scale[rows, step : step + 1]
-        return ContinuousDistribution(self.output, self.mean[rows, step : step + 1], scale)
+        """That of some windows, (n,) their numbers, at one step: (n, 1, ...)."""
+        here = [part[rows, step : step + 1] for part in (self.weights, self.means)]
+        scales = None if self.scales is None else self.scales[rows, step : step + 1]
+        return ContinuousDistribution(self.output, *here, scales)
 
     def draw(self, generator: torch.Generator | None) -> Tensor:
-        """One sample for each step, (B, K, d); an L2 head's is its mean."""
-        if self.scale is None:
+        """One sample for each step, (B, K, d): of one Gaussian, drawn by its weight; an L2 head's is its mean."""
+        if self.scales is None:
             return self.mean
-        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device)
-        return self.mean + self.scale * noise
+        mean, scale = self.means[..., 0, :], self.scales[..., 0, :]
+        if self.means.shape[-2] > 1:
+            chosen = torch.multinomial(self.weights.nan_to_num(1.0).flatten(0, 1), 1, generator=generator)
+            chosen = chosen.view(*self.weights.shape[:2], 1, 1)
+            mean, scale = (part.take_along_dim(chosen, -2)[..., 0, :] for part in (self.means, self.scales))
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        return mean + scale * noise
 
 
 Distribution = DiscreteDistribution | ContinuousDistribution
@@ -189,9 +242,13 @@ def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None)
                 probabilities = torch.where(known, probabilities, torch.nan)
                 distributions[name].append(DiscreteDistribution(output, probabilities))
             else:
-                mean, scale = model.statistics.denormalise(name, output, prediction)
-                mean = torch.where(known, torch.where(shown, window.values[name][..., output.numbers], mean), torch.nan)
-                if scale is not None:
-                    scale = torch.where(known, torch.where(shown, 0.0, scale), torch.nan)
-                distributions[name].append(ContinuousDistribution(output, mean, scale))
+                weights, means, scales = model.statistics.denormalise(name, output, prediction)
+                first = torch.zeros_like(weights).index_fill_(-1, torch.tensor(0, device=weights.device), 1.0)
+                weights = torch.where(known, torch.where(shown, first, weights), torch.nan)
+                value = window.values[name][..., output.numbers].unsqueeze(-2)
+                here, there = shown.unsqueeze(-1), known.unsqueeze(-1)  # (B, K, 1, 1)
+                means = torch.where(there, torch.where(here, value, means), torch.nan)
+                if scales is not None:
+                    scales = torch.where(there, torch.where(here, 0.0, scales), torch.nan)
+                distributions[name].append(ContinuousDistribution(output, weights, means, scales))
     return Answer(mask, distributions)

@@ -78,10 +78,11 @@ class Component:
 @dataclass(frozen=True)
 class Output:
     """What a network predicts of a token in one piece: discrete components together, as one distribution over all
-    combinations of their categories, or a continuous one."""
+    combinations of their categories; or continuous ones, as a mean, or as Gaussians, each with a weight and with means
+    and scales of all numbers."""
 
     components: tuple[Component, ...]
-    gaussian: bool = False  # continuous, predicted as a mean and a scale
+    gaussians: int = 0  # 0: a mean
 
     @property
     def discrete(self) -> bool:
@@ -104,10 +105,31 @@ class Output:
 
     @property
     def size(self) -> int:
-        """Of a prediction: logits of the combinations; or a mean for each number, then logarithms of the scales."""
+        """Of a prediction: logits of the combinations; or the parts that `unpack` makes of it."""
         if self.discrete:
             return math.prod(self.categories)
-        return (1 + self.gaussian) * len(self.numbers)
+        return sum(self._parts)
+
+    @property
+    def _parts(self) -> tuple[int, int, int]:
+        """Numbers of logits, means and logarithms of scales in a prediction; a single Gaussian needs no logit."""
+        logits, means = self.gaussians if self.gaussians > 1 else 0, max(self.gaussians, 1) * len(self.numbers)
+        return logits, means, means if self.gaussians else 0
+
+    def unpack(self, prediction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A continuous prediction, (..., size) -> logits (..., n) of n Gaussians, their means (..., n, d) and
+        logarithms of their scales (..., n, d), 0 where only a mean is predicted."""
+        logits, means, scales = prediction.split(self._parts, dim=-1)
+        means = means.unflatten(-1, (-1, len(self.numbers)))
+        scales = scales.unflatten(-1, (-1, len(self.numbers))) if self.gaussians else torch.zeros_like(means)
+        if not self._parts[0]:
+            logits = torch.zeros_like(means[..., 0])
+        return logits, means, scales.clamp(*LOG_SCALE)
+
+    def pack(self, logits: Tensor, means: Tensor, scales: Tensor) -> Tensor:
+        """What `unpack` unpacks."""
+        parts = (logits, means.flatten(-2), scales.flatten(-2))
+        return torch.cat([part for part, size in zip(parts, self._parts, strict=True) if size], dim=-1)
 
     def combination(self, values: Tensor) -> Tensor:
         """The discrete values of tokens, (..., D), as numbers of combinations, (...); the last category runs first."""
@@ -150,14 +172,15 @@ class Factor:
 
 
 def make_factors(
-    features: Mapping[str, Sequence[Feature]], *, joint: bool = False, gaussian: bool = False
+    features: Mapping[str, Sequence[Feature]], *, joint: bool = False, gaussians: int = 0
 ) -> dict[str, Factor]:
     """The model's factors from the features that its config stores under each name.
 
     Args:
         joint: predict a token's discrete components as one distribution, where it is over at most `MAX_JOINT`
             combinations; otherwise each by itself.
-        gaussian: predict continuous components as a mean and a scale.
+        gaussians: number of Gaussians that continuous components are predicted as: 0, a mean alone; 1, a mean and a
+            scale for each number; more, a mixture over all of a token's continuous numbers.
     """
     factors = {}
     for name, columns in features.items():
@@ -175,18 +198,18 @@ def make_factors(
             start += feature.size
         if name == "rtg":  # the token is the pair (return-to-go, timestep / horizon)
             components.append(Component("timestep", slice(start, start + 1), None, computed=True))
-        factors[name] = Factor(name, tuple(components), _outputs(components, joint=joint, gaussian=gaussian))
+        factors[name] = Factor(name, tuple(components), _outputs(components, joint=joint, gaussians=gaussians))
     return factors
 
 
-def _outputs(components: Sequence[Component], *, joint: bool, gaussian: bool) -> tuple[Output, ...]:
-    discrete = tuple(component for component in components if component.discrete)
-    together = joint and len(discrete) > 1 and math.prod(c.categories or 1 for c in discrete) <= MAX_JOINT
-    outputs = [Output(discrete)] if together else []
-    for component in components:
-        if not (together and component.discrete):
-            outputs.append(Output((component,), gaussian=gaussian and not component.discrete))
-    return tuple(outputs)
+def _outputs(components: Sequence[Component], *, joint: bool, gaussians: int) -> tuple[Output, ...]:
+    discrete = [component for component in components if component.discrete]
+    continuous = [component for component in components if not component.discrete]
+    together = joint and math.prod(c.categories or 1 for c in discrete) <= MAX_JOINT
+    groups = [discrete] if together else [[component] for component in discrete]
+    outputs = [Output(tuple(group)) for group in groups if group]
+    groups = [continuous] if gaussians > 1 else [[component] for component in continuous]
+    return tuple(outputs + [Output(tuple(group), gaussians) for group in groups if group])
 
 
 def names_of(feature: Feature) -> tuple[str, ...]:

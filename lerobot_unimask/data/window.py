@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from lerobot_unimask.data.factors import (
     ACTION,
-    LOG_SCALE,
     STATE,
     Camera,
     Factor,
@@ -294,14 +293,12 @@ class Statistics(nn.Module):
         }
         return Window(window.values | values, window.valid)  # pictures as they are
 
-    def denormalise(self, name: str, output: Output, prediction: Tensor) -> tuple[Tensor, Tensor | None]:
-        """A prediction of one continuous output, (..., size), as mean and scale in the dataset's units, each (..., d);
-        the scale is None where the head predicts none."""
+    def denormalise(self, name: str, output: Output, prediction: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """A prediction of one continuous output, (..., size), as weights (..., n), means and scales (..., n, d) of n
+        Gaussians, in the dataset's units; the scales are None where the head predicts none."""
         mean, std = (self.get_buffer(f"{name}_{part}")[output.numbers] for part in ("mean", "std"))
-        if not output.gaussian:
-            return prediction * std + mean, None
-        normalised_mean, log_scale = prediction.chunk(2, dim=-1)
-        return normalised_mean * std + mean, log_scale.clamp(*LOG_SCALE).exp() * std
+        logits, means, scales = output.unpack(prediction)
+        return logits.softmax(-1), means * std + mean, scales.exp() * std if output.gaussians else None
 
 
 def _numbers(value: Any) -> Tensor:

@@ -4,6 +4,7 @@ Legend of shapes: B windows, K steps, N tokens, D the numbers of a factor, W wid
 """
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -189,12 +190,41 @@ def by_component(predictions: Predictions, factors: Mapping[str, Factor]) -> Pre
 
 
 def marginals(prediction: Tensor, output: Output) -> list[Tensor]:
-    """A prediction, (..., size), of each of its components without the others: log-odds, (..., categories) each."""
+    """A prediction, (..., size), of each of its components without the others."""
     if len(output.components) == 1:
         return [prediction]
+    if not output.discrete:
+        logits, means, scales = output.unpack(prediction)
+        sizes = [len(part.numbers) for part in output.apart]
+        pairs = zip(output.apart, means.split(sizes, dim=-1), scales.split(sizes, dim=-1), strict=True)
+        return [part.pack(logits, *of_numbers) for part, *of_numbers in pairs]
     table = prediction.unflatten(-1, output.categories)
     axes = range(-len(output.categories), 0)
     return [table.logsumexp([other for other in axes if other != axis]) for axis in axes]
+
+
+def joined(
+    weights: Mapping[str, Tensor], separate: Mapping[str, Factor], joint: Mapping[str, Factor]
+) -> dict[str, Tensor]:
+    """A checkpoint's weights of separate heads as those of joint ones, which at first answer the same: the logit of a
+    combination is the sum of its categories'. Of heads that are joint already, nothing."""
+    heads: dict[str, Tensor] = {}
+    for key, rows in weights.items():
+        found = re.fullmatch(r"network\.heads\.(\w+)\.(weight|bias)", key)
+        if found is None or separate == joint:
+            continue
+        outputs = separate[found[1]].outputs
+        sizes = [output.size for output in outputs]
+        parts = rows.unflatten(0, (-1, sum(sizes))).split(sizes, dim=1)  # (steps, size, ...) each
+        of_number = {output.numbers[0]: part for output, part in zip(outputs, parts, strict=True)}
+        whole = []
+        for output in joint[found[1]].outputs:
+            total, *others = (of_number[number] for number in output.numbers if number in of_number)
+            for other in others:
+                total = (total.unsqueeze(2) + other.unsqueeze(1)).flatten(1, 2)
+            whole.append(total)
+        heads[key] = torch.cat(whole, dim=1).flatten(0, 1)
+    return heads
 
 
 @dataclass

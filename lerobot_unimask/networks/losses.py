@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import LOG_SCALE, Factor, Output
+from lerobot_unimask.data.factors import Factor, Output
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.networks.layers import Predictions, marginals
 
@@ -45,23 +45,24 @@ class LossParts(MutableMapping[str, Any]):
 
 def output_loss(prediction: Tensor, value: Tensor, output: Output) -> Tensor:
     """What one output costs at every step, (B, K): cross-entropy in nats; or, averaged over its numbers and in units of
-    their standard deviations, the squared error or a Gaussian's negative log-likelihood in nats.
+    their standard deviations, the squared error or the Gaussians' negative log-likelihood in nats.
 
-    Note: A Gaussian's gradient is that of the negative log-likelihood times the predicted scale (Seitzer et al., "On
-        the pitfalls of heteroscedastic uncertainty estimation", 2022, beta = 1/2). Without it, what is predicted to
-        within a fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model that learns
-        where the mass goes is slow to learn what moves it (docs/experiments.md).
+    Note: The gradient of a Gaussian's means and scales is that of the negative log-likelihood times the predicted
+        scale (Seitzer et al., "On the pitfalls of heteroscedastic uncertainty estimation", 2022, beta = 1/2); a
+        mixture's Gaussians besides share it as they share the density. Without it, what is predicted to within a
+        fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model that learns where the
+        mass goes is slow to learn what moves it (docs/experiments.md).
     """
     if output.discrete:
         return functional.cross_entropy(prediction.transpose(1, 2), output.combination(value), reduction="none")
     target = value[..., output.numbers]
-    if output.gaussian:
-        mean, log_scale = prediction.chunk(2, dim=-1)
-        log_scale = log_scale.clamp(*LOG_SCALE)
-        surprise = (target - mean) * (-log_scale).exp()
-        cost = surprise.square() / 2 + log_scale + math.log(2 * math.pi) / 2
-        value = cost.detach()
-        return (value + log_scale.detach().exp() * (cost - value)).mean(-1)
+    if output.gaussians:
+        logits, means, scales = output.unpack(prediction)
+        surprise = (target.unsqueeze(-2) - means) * (-scales).exp()
+        cost = surprise.square() / 2 + scales + math.log(2 * math.pi) / 2  # (B, K, n, d)
+        constant = cost.detach()
+        cost = constant + scales.detach().exp() * (cost - constant)
+        return -(logits.log_softmax(-1) - cost.sum(-1)).logsumexp(-1) / target.shape[-1]
     return (prediction - target).square().mean(-1)
 
 

@@ -76,8 +76,8 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
         self.on_course = {
-            i: output.numbers for i, output in enumerate(factors["s"].outputs) if residuals and not output.discrete
-        }  # which of the states' outputs, and their numbers
+            i: output for i, output in enumerate(factors["s"].outputs) if residuals and not output.discrete
+        }
         self.heads = Heads(factors, width)
         self.cameras = nn.ModuleDict(
             {name: CameraEmbedding(camera.shape, width, **(backbone or {})) for name, camera in cameras.items()}
@@ -121,9 +121,10 @@ class Transformer(nn.Module):
         if self.on_course:
             states = torch.where(shown["s"].unsqueeze(-1), window.values["s"], 0.0)
             ahead = course(states, shown["s"], causal)
-            for i, numbers in self.on_course.items():
-                mean, scale = predictions["s"][i].tensor_split([len(numbers)], dim=-1)
-                predictions["s"][i] = torch.cat([mean + ahead[..., numbers], scale], dim=-1)
+            for i, output in self.on_course.items():
+                logits, means, scales = output.unpack(predictions["s"][i])
+                means = means + ahead[..., output.numbers].unsqueeze(-2)
+                predictions["s"][i] = output.pack(logits, means, scales)
         return predictions
 
     def _predict_asked(self, x: Tensor, causal: Tensor | bool, asked: dict[str, Tensor]) -> Predictions:

@@ -56,7 +56,8 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
         window: Which of the answer's windows.
     """
     state = answer["s"][0]
-    mean = state.mean[window].numpy(force=True)  # (K, 4): x, y, goal x, goal y
+    mean = state.most_likely[window].numpy(force=True)  # (K, 4): x, y, goal x, goal y
+    weights, means = (part[window].numpy(force=True) for part in (state.weights, state.means))  # (K, n), (K, n, 4)
     scale = None if state.scale is None else state.scale[window].numpy(force=True)
     shown = answer.mask.shown["s"][window].numpy(force=True)  # (K,)
     recorded = None if truth is None else truth.values["s"][window][truth.valid[window]].numpy(force=True)
@@ -72,9 +73,11 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
             *mean[shown, :2].T, s=42, marker="s", facecolors="none", edgecolors=PURPLE, linewidths=1.8, zorder=4
         )
         axes.scatter(*goal, marker="*", s=130, color=GREEN, edgecolors="white", linewidths=0.6, zorder=5)
-        for at, wide in zip(mean, scale if scale is not None else (), strict=False):
-            if not np.isnan(at).any() and wide[:2].any():
-                axes.add_patch(Ellipse(at[:2], *(4 * wide[:2]), color=BLUE, alpha=0.16, linewidth=0, zorder=1))
+        for step, i in np.ndindex(weights.shape) if state.scales is not None else ():
+            wide = state.scales[window, step, i, :2].numpy(force=True)
+            if not np.isnan(wide).any() and wide.any():  # a Gaussian of more weight is darker
+                style = {"color": BLUE, "alpha": 0.16 * weights[step, i] ** 0.5, "linewidth": 0, "zorder": 1}
+                axes.add_patch(Ellipse(means[step, i, :2], *(4 * wide), **style))
     _zoom(close, mean, scale, recorded)
     whole.set_title("the maze", fontsize=NORMAL)
     close.set_title("closer", fontsize=NORMAL)
@@ -83,7 +86,7 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
     handles = [
         Patch(facecolor=WALL, label="wall"),
         Line2D([], [], marker="*", linestyle="none", markersize=10, color=GREEN, label="goal"),
-        Line2D([], [], marker="o", markersize=3, linewidth=1, color=BLUE, label="predicted mean"),
+        Line2D([], [], marker="o", markersize=3, linewidth=1, color=BLUE, label="most likely"),
     ]
     if scale is not None:
         handles.append(Patch(facecolor=BLUE, alpha=0.25, label="two scales around it"))
