@@ -378,3 +378,16 @@ def test_a_question_changed_in_the_settings_takes_effect_at_the_next_step(tiny_p
         if step == 3:
             policy.config.inference_mask, policy.config.given = "goal_conditioned", goal
         assert torch.equal(policy.select_action({"observation.state": state}), by_call[step])
+
+
+@pytest.mark.parametrize("attention", ["both", "causal", "bidirectional"])
+def test_what_a_sliding_window_keeps_changes_no_action(attention, tiny_policy):
+    policy = tiny_policy("gaussian", context_length=6, attention=attention, training_masks="behavior_cloning")
+    states, actions = Episode("gaussian", 3, 16).states, []
+    for keeps in (True, False):
+        policy.reset()
+        for step, state in enumerate(states):
+            if not keeps and step:
+                policy._memory.cache = type(policy._memory.cache)()
+            actions.append(policy.select_action({"observation.state": state}))
+    torch.testing.assert_close(torch.stack(actions[16:]), torch.stack(actions[:16]), rtol=1e-5, atol=1e-5)

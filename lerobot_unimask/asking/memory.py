@@ -49,7 +49,7 @@ class RolloutMemory:
         self.task: str | Sequence[str] | None = None  # what each environment is to do, as it says at this step
         self.planned: list[Tensor] = []  # actions of a chunk that are still to be carried out, each (B, D)
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
-        self.cache = Cache()  # of the steps in the window, until it slides
+        self.cache = Cache()  # of the steps in the window
 
     @property
     def position(self) -> int:
@@ -76,7 +76,7 @@ class RolloutMemory:
                 for name in (*ASKABLE, *self.cameras):
                     self.values[name] = self.values[name].roll(-1, dims=1)
                 self.return_so_far = self.return_so_far.roll(-1, dims=1)
-                self.cache = Cache()
+                self.cache.slide()
             self.acted = False
         state = state.clone()
         if self.step == 0:

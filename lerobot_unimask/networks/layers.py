@@ -229,12 +229,38 @@ def joined(
 
 @dataclass
 class Cache:
-    """What causal attention has computed for a window's first n tokens: their inputs, (B, n, W), and each block's keys
-    and values, (B, H, n, W/H)."""
+    """What a rollout has computed of its window: each factor's values, (B, K, D), shown, (B, K), and tokens, (B, K, W);
+    and of causal attention, for the first n tokens, their inputs, (B, n, W), and each block's keys and values, (B, H,
+    n, W/H)."""
 
+    embedded: dict[str, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict)
     inputs: Tensor | None = None
     keys: list[Tensor] = field(default_factory=list)
     values: list[Tensor] = field(default_factory=list)
+
+    def slide(self) -> None:
+        """Forget what depends on where in the window a token stands: all that comes after its embedding."""
+        self.inputs, self.keys, self.values = None, [], []
+
+    def embed(self, name: str, embedding: nn.Module, value: Tensor, shown: Tensor) -> Tensor:
+        """A factor's tokens, (B, K, W). Once the window stands a step later than before, three of them are new: the
+        first, whose displacement is lost, and the last two. The others depend on themselves and the step before."""
+        tokens = self._kept(name, value, shown)
+        if tokens is None:
+            tokens = embedding(value, shown)
+        else:
+            new = embedding(*(torch.cat([x[:, :1], x[:, -3:]], dim=1) for x in (value, shown)))
+            tokens = torch.cat([new[:, :1], tokens, new[:, 2:]], dim=1)
+        self.embedded[name] = value, shown, tokens
+        return tokens
+
+    def _kept(self, name: str, value: Tensor, shown: Tensor) -> Tensor | None:
+        """Tokens 1 to K - 3, if the window shows there what it showed a step earlier."""
+        if name not in self.embedded or shown.shape[1] < 5:
+            return None
+        before, shown_before, tokens = self.embedded[name]
+        everything_shown = shown[:, :-2].all() and shown_before[:, 1:-1].all()
+        return tokens[:, 2:-1] if everything_shown and torch.equal(value[:, :-2], before[:, 1:-1]) else None
 
     def matches(self, x: Tensor) -> bool:
         """Whether (B, N, W) begins with the tokens that are kept; nothing else could be answered from them."""

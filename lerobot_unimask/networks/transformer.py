@@ -104,8 +104,12 @@ class Transformer(nn.Module):
             asked: factor -> (B, K) bool, True = asked: what is read of the predictions. On a processor the last block
                 and the heads compute nothing else. None: all.
         """
-        embeddings = (*self.embeddings.items(), *self.cameras.items())
-        tokens = {name: embed(window.values[name], shown[name]) for name, embed in embeddings}
+        tokens = {
+            name: cache.embed(name, embed, window.values[name], shown[name])
+            if cache is not None and name in ASKABLE
+            else embed(window.values[name], shown[name])
+            for name, embed in (*self.embeddings.items(), *self.cameras.items())
+        }
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
         x = self.dropout(x + self.positions)
         static = x.device.type != "cpu" or torch.compiler.is_compiling()  # how much is computed never depends on masks
@@ -118,7 +122,7 @@ class Transformer(nn.Module):
                 before = functional.pad(x, (0, 0, 1, -1))
                 x = before if causal is True else torch.where(causal[:, None, None], before, x)
             predictions = self.heads(dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x))
-        if self.on_course:
+        if self.on_course and (asked is None or static or asked["s"].any()):
             states = torch.where(shown["s"].unsqueeze(-1), window.values["s"], 0.0)
             ahead = course(states, shown["s"], causal)
             for i, output in self.on_course.items():
