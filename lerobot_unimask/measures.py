@@ -83,7 +83,7 @@ def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     policy.eval()
     recorded = policy.make_window(batch)
     actions = recorded.values["a"]  # (B, K, D)
-    table = tabulate(question, tuple(policy.factors), policy.config.context_length)
+    table = tabulate(question, tuple(policy.factors), policy.config.context_length, tuple(policy.cameras))
     errors = []
     for t in table.t.tolist():
         mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
@@ -99,7 +99,7 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     over all windows and steps t, outputs added up. An L2 head counts as a Gaussian of the data's scale."""
     policy.eval()
     window = policy.statistics.normalise(policy.make_window(batch))
-    table = tabulate(question, tuple(policy.factors), policy.config.context_length)
+    table = tabulate(question, tuple(policy.factors), policy.config.context_length, tuple(policy.cameras))
     found = []
     for t in table.t.tolist():
         mask: Mask = table.at(t, len(window.valid)).to(policy.device).within(window.valid)

@@ -51,8 +51,10 @@ def given_from_episodes(
     windows = [policy.make_window(read_window(dataset, number), partial=True) for number in numbers]
     rows = {}
     for text in re.split(r",(?![^\[]*\])", tokens):  # at commas outside brackets
-        token = parse_token(text.strip(), tuple(policy.factors), policy.config.context_length)
+        token = parse_token(text.strip(), tuple(policy.factors), policy.config.context_length, tuple(policy.cameras))
         name, step, here = token.factor, token.step, windows
+        if name in policy.cameras:
+            raise ValueError(f'{token} is a picture, which is given by its file: {{"{token}": "goal.png"}}.')
         if token.of_episode:
             here = [policy.make_window(read_window(dataset, number, step), partial=True) for number in numbers]
             step = 0
@@ -131,7 +133,8 @@ def ask(
     """
     recorded = None if batch is None else policy.make_window(batch, partial=True)
     start = source.start if source else 0
-    question = tabulate(mask, tuple(policy.factors), policy.config.context_length).at(t).to(policy.device)
+    table = tabulate(mask, tuple(policy.factors), policy.config.context_length, tuple(policy.cameras))
+    question = table.at(t).to(policy.device)
     if recorded is not None:
         question = question.within(recorded.valid)
         if not any(asked.any() for asked in question.asked.values()):
@@ -352,7 +355,7 @@ def overview(policy: UniMASKPolicy) -> dict[str, Any]:
     tasks = []
     for name, text in TASKS.items():
         try:
-            table = tabulate(text, tuple(policy.factors), K)
+            table = tabulate(text, tuple(policy.factors), K, tuple(policy.cameras))
         except MaskError:
             continue  # a factor that this model does not have
         t = int(table.t[len(table.t) // 3])
@@ -365,6 +368,7 @@ def overview(policy: UniMASKPolicy) -> dict[str, Any]:
         "attention": policy.config.attention,
         "training_masks": policy.training_masks.weights,
         "factors": factors,
+        "cameras": {name: {"column": camera.key, "shape": camera.shape} for name, camera in policy.cameras.items()},
         "tasks": tasks,
     }
 
@@ -375,7 +379,7 @@ def describe_overview(result: Mapping[str, Any]) -> str:
         f"{result['policy']['path']}: windows of {result['context_length']} steps, 0 to {result['context_length'] - 1}"
     ]
     lines += ["", "Factors, with the dataset's units:"]
-    width = max(map(len, result["factors"]))
+    width_of = max(map(len, (*result["factors"], *result["cameras"])))
     for name, components in result["factors"].items():
         where = "" if name in ASKABLE else f"; shown as {name}[0] or not at all"
         for part in components:
@@ -384,7 +388,14 @@ def describe_overview(result: Mapping[str, Any]) -> str:
                 if "categories" in part
                 else f"number, {part['mean']:.4g} ± {part['std']:.3g} in the training data"
             )
-            lines.append(f"  {name:{width}}  {part['component']}: {kind}{where}")
+            lines.append(f"  {name:{width_of}}  {part['component']}: {kind}{where}")
+    for name, camera in result["cameras"].items():
+        height, width = camera["shape"][1:]
+        lines.append(
+            f"  {name:{width_of}}  pictures of {camera['column']}, read at {height} x {width}; shown at any step"
+        )
+    if result["cameras"]:
+        lines.append("  s is the numbers and every camera; state is the numbers.")
     lines += ["", "Named tasks (# shown, ? asked, . neither):"]
     name, mask = (max(len(task[key]) for task in result["tasks"]) for key in ("name", "mask"))
     lines += [

@@ -46,7 +46,7 @@ def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable
     normalised = policy.statistics.normalise(window)
     losses = {}
     for text in masks:
-        mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"])
+        mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"], tuple(policy.cameras))
         predictions = policy.predict(normalised, mask)
         parts = masked_losses(predictions, normalised, mask.asked, policy.factors, apart=True)
         losses[text] = sum(part.item() for part in parts.values())
@@ -60,7 +60,7 @@ def probability_of_truth(policy: UniMASKPolicy, batch: dict[str, Tensor], text: 
     Of one task with discrete factors; outputs of a token are independent, so their probabilities multiply.
     """
     window = policy.make_window(batch)
-    mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"])
+    mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"], tuple(policy.cameras))
     answer = policy.infer(window, mask)
     probabilities = []
     for name, distributions in answer.distributions.items():

@@ -14,6 +14,10 @@ from lerobot_unimask.data import frames
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.measures import action_error
+from lerobot_unimask.query import describe_overview, overview
+from lerobot_unimask.sharing import cards
+from lerobot_unimask.validation import task_losses
 
 K, SIDE = 6, 16
 CAMERAS = ("top", "wrist")
@@ -342,3 +346,21 @@ def test_one_picture_serves_all_steps_of_a_causal_window(make, batch):
         make(training_masks="a[t] | state[:t+1], a[:t], top[t]", attention="causal")
     with pytest.raises(MaskError, match="attends causally alone"):
         policy.infer(batch, "a[t] | state[:t+1], a[:t]", t=3)
+
+
+def test_cards_and_the_overview_say_what_is_looked_at(make, tmp_path):
+    policy = make(training_masks=["random_mask", "a[t] | s[:t+1], a[:t], top[-1]"])
+    policy.save_pretrained(tmp_path)
+    card = cards.policy_card(policy.card_facts(tmp_path), "me/arm")["README.md"].decode()
+    assert "observation.images.wrist" in card
+    assert "3 x 16 x 16" in card
+    text = describe_overview(overview(policy))
+    assert "top" in text
+    assert "pictures of observation.images.top, read at 16 x 16" in text
+
+
+def test_measures_and_losses_read_pictures(make, batch):
+    policy = make()
+    whole = {**batch, "action_is_pad": torch.zeros(3, K, dtype=torch.bool)}
+    assert action_error(policy, whole, "behavior_cloning") > 0
+    assert task_losses(policy, whole, ["behavior_cloning", "random_mask"]).keys() == {"behavior_cloning", "random_mask"}

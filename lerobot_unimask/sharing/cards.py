@@ -104,32 +104,36 @@ def policy_card(facts: PolicyFacts, repo_id: str, results: Sequence[Mapping[str,
 def _questions(facts: PolicyFacts) -> tuple[str, bytes]:
     """Each training mask with its share of the windows and, drawn, one of its masks; the acting question's picture."""
     factors, K = tuple(facts.config.features), facts.config.context_length
+    cameras = tuple(facts.config.pictures)
     weights = facts.weights
     lines = []
     for text, weight in weights.items():
         if text == RANDOM_MASK:
-            mask, meaning = _random_example(factors, K), "any states and actions given any others; for instance"
+            mask, meaning = (
+                _random_example(factors, K, cameras),
+                "any states and actions given any others; for instance",
+            )
         else:
-            mask, t = _example(text, factors, K)
+            mask, t = _example(text, factors, K, cameras)
             meaning = TASKS.get(text, text) + (f"   at t = {t}" if t is not None else "")
         name = text if text in TASKS or text == RANDOM_MASK else "question"
         lines += [f"{name} ({weight / sum(weights.values()):.0%}): {meaning}", indent(mask.draw(), "    ")]
-    acting, _ = _example(facts.config.inference_mask, factors, K)
+    acting, _ = _example(facts.config.inference_mask, factors, K, cameras)
     legend = "Shown `#`, asked `?`, neither `.`, over the steps of a window:"
     return f"{legend}\n\n{_code(chr(10).join(lines), 'text')}", _png(mask_diagram(acting))
 
 
-def _example(text: str, factors: tuple[str, ...], K: int) -> tuple[Mask, int | None]:
+def _example(text: str, factors: tuple[str, ...], K: int, cameras: tuple[str, ...]) -> tuple[Mask, int | None]:
     """A question's mask, at the middle one of its t, and that t."""
-    table = tabulate(text, factors, K)
+    table = tabulate(text, factors, K, cameras)
     t = int(table.t[len(table.t) // 2]) if table.question.uses_t else None
     return table.at(t), t
 
 
-def _random_example(factors: tuple[str, ...], K: int) -> Mask:
+def _random_example(factors: tuple[str, ...], K: int, cameras: tuple[str, ...]) -> Mask:
     """Of some windows' draws the one that hides nearest to half of the states and actions."""
     windows = 64
-    draws = TrainingMasks(RANDOM_MASK, factors, K)(
+    draws = TrainingMasks(RANDOM_MASK, factors, K, cameras=cameras)(
         torch.ones(windows, K, dtype=torch.bool), torch.arange(windows), seed=0, step=0
     )
     hidden = torch.cat(list(draws.asked.values()), dim=1).sum(1)  # (64,)
@@ -150,6 +154,9 @@ def _model(facts: PolicyFacts) -> str:
                 values = " x ".join(map(str, feature.categories)) + " categories"
             rows.append([_span(name), _span(feature.key), feature.size, names, values])
     config = facts.config
+    for name, camera in config.pictures.items():
+        shape = " x ".join(map(str, camera.shape))
+        rows.append([_span(name), _span(camera.key), shape, "", "pictures, read at this size; shown, never asked"])
     table = markdown_table(("factor", "column", "numbers", "names", "values"), rows)
     return (
         f"{table}\n\nContext length: {config.context_length} steps. Attention: {config.attention}. Acting asks "
@@ -177,7 +184,7 @@ def _commands(facts: PolicyFacts, repo_id: str) -> str:
         dataset += f" --dataset.root={shlex.quote(str(data['root']))}"
     environment = (train_config.get("env") or {}).get("type") or _robot(data.get("root")) or "YOUR_ENVIRONMENT"
     question = next((text for text in facts.weights if text != RANDOM_MASK), "behavior_cloning")
-    _, t = _example(question, tuple(config.features), config.context_length)
+    _, t = _example(question, tuple(config.features), config.context_length, tuple(config.pictures))
     at = "" if t is None else f" --t={t}"
     return (
         f"lerobot-eval --policy.path={repo_id} --env.type={shlex.quote(str(environment))} --eval.n_episodes=100 "
