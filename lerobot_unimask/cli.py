@@ -5,10 +5,23 @@ import logging
 import shlex
 import sys
 
-from lerobot_unimask.commands import bench, build, demo, given, measure, paper, prepare, push, query, serve, validate
+from lerobot_unimask.commands import (
+    bench,
+    build,
+    demo,
+    frames,
+    given,
+    measure,
+    paper,
+    prepare,
+    push,
+    query,
+    serve,
+    validate,
+)
 from lerobot_unimask.commands.flags import Parser, check_dataset
 
-COMMANDS = (demo, build, prepare, query, given, validate, measure, push, serve, bench, paper)
+COMMANDS = (demo, build, prepare, query, given, validate, measure, push, frames, serve, bench, paper)
 
 
 def make_parser() -> Parser:

@@ -9,6 +9,7 @@ from lerobot.envs.factory import make_env_config
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask.cli import main
 from lerobot_unimask.data import frames
 from lerobot_unimask.envs.doorkey.environment import DoorKeyEnv
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
@@ -96,3 +97,13 @@ def test_a_policy_is_trained_on_pictures_and_acts_from_them(maze_root, tmp_path)
         rollout(
             tmp_path / "policy", "maze2d", 1, batch_size=1, seed=0, environment={"maze": "umaze", "hide_goal": True}
         )
+
+
+def test_decoded_frames_are_counted_and_removed(maze_root, tmp_path, capsys):
+    dataset = LeRobotDataset("local/maze2d", root=maze_root)
+    frames.cached_frames(dataset, KEY, (24, 24), tmp_path / "frames")
+    main(["frames"])
+    assert "frames of 1 cameras, 0.00069" in capsys.readouterr().out  # 400 x 3 x 24 x 24 bytes
+    main(["frames", "--remove=true"])
+    assert "removed" in capsys.readouterr().out
+    assert frames.stored_files() == []

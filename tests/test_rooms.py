@@ -111,6 +111,7 @@ FLOORS = [
     "lerobot_unimask/commands/prepare.py",
     "lerobot_unimask/commands/query.py",
     "lerobot_unimask/commands/given.py",
+    "lerobot_unimask/commands/frames.py",
     "lerobot_unimask/commands/validate.py",
     "lerobot_unimask/commands/measure.py",
     "lerobot_unimask/commands/serve.py",
