@@ -9,7 +9,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lerobot_unimask.asking.answers import Answer, ContinuousDistribution
-from lerobot_unimask.asking.given import Given
+from lerobot_unimask.asking.given import Given, read_given
+from lerobot_unimask.asking.looking import shown_pictures
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples
 from lerobot_unimask.data.episodes import episode_numbers, provenance_of, read_window
@@ -30,6 +31,7 @@ from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import ASKABLE, TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.plots.answers import distributions, marginals
+from lerobot_unimask.plots.thumbnails import add_thumbnails
 
 
 def given_from_episodes(
@@ -100,13 +102,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a question: marginals, or samples where those were asked for; what was recorded; and the exact
-    optimum's marginals, where those were asked for too."""
+    """What came of a question: marginals, or samples where those were asked for; what was recorded; the exact optimum's
+    marginals, where those were asked for too; and the pictures that were shown, (H, W, C) by token."""
 
     mask: Mask
     answer: Answer | Samples
     recorded: Window | None
     exact: Answer | None = None
+    pictures: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 def ask(
@@ -160,7 +163,8 @@ def ask(
         window, shown = pose_question(policy, recorded, mask, t, given)
         cpu = torch.device("cpu")
         best = environment.exact_answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
-    return Reply(question, answer, recorded, best)
+    own = read_given(given or {}, policy.factors, policy.config.context_length, 1, policy.cameras)
+    return Reply(question, answer, recorded, best, shown_pictures(policy, recorded, question, own))
 
 
 def _environment(policy: UniMASKPolicy) -> Environment | None:
@@ -411,7 +415,14 @@ def describe_overview(result: Mapping[str, Any]) -> str:
 
 
 def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, source: Source | None = None) -> Figure:
-    """The picture that suits the environment and the answer; of any other model, its marginals or distributions."""
+    """The picture that suits the environment and the answer, under those that the question shows."""
+    figure = _picture_of_answer(policy, mask, reply, source)
+    add_thumbnails(figure, {token: shown.numpy() for token, shown in reply.pictures.items()})
+    return figure
+
+
+def _picture_of_answer(policy: UniMASKPolicy, mask: str, reply: Reply, source: Source | None) -> Figure:
+    """That of the environment; of any other model, its marginals or distributions."""
     environment = _environment(policy)
     if environment is not None and environment.draw_answer is not None:
         provenance = provenance_of(source.folder) if source else {}

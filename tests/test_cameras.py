@@ -9,13 +9,12 @@ import torch
 from PIL import Image
 from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, assert_same_answers
 
-from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask import UniMASKPolicy, query
 from lerobot_unimask.data import frames
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.measures import action_error
-from lerobot_unimask.query import describe_overview, overview
 from lerobot_unimask.sharing import cards
 from lerobot_unimask.validation import task_losses
 
@@ -354,7 +353,7 @@ def test_cards_and_the_overview_say_what_is_looked_at(make, tmp_path):
     card = cards.policy_card(policy.card_facts(tmp_path), "me/arm")["README.md"].decode()
     assert "observation.images.wrist" in card
     assert "3 x 16 x 16" in card
-    text = describe_overview(overview(policy))
+    text = query.describe_overview(query.overview(policy))
     assert "top" in text
     assert "pictures of observation.images.top, read at 16 x 16" in text
 
@@ -364,3 +363,17 @@ def test_measures_and_losses_read_pictures(make, batch):
     whole = {**batch, "action_is_pad": torch.zeros(3, K, dtype=torch.bool)}
     assert action_error(policy, whole, "behavior_cloning") > 0
     assert task_losses(policy, whole, ["behavior_cloning", "random_mask"]).keys() == {"behavior_cloning", "random_mask"}
+
+
+def test_a_query_names_and_draws_the_pictures_shown(make, batch, tmp_path):
+    policy = make()
+    Image.fromarray(np.zeros((20, 20, 3), np.uint8)).save(tmp_path / "goal.png")
+    one = {key: value[:1] for key, value in batch.items()}
+    question = "a[t] | state[:t+1], a[:t], top[0, -1], wrist[t]"
+    reply = query.ask(policy, question, batch=one, t=2, given={"top[-1]": str(tmp_path / "goal.png")})
+    assert list(reply.pictures) == ["top[0]", "wrist[2]", f"top[{K - 1}]"]
+    assert reply.pictures[f"top[{K - 1}]"].max() == 0
+    assert torch.equal(reply.pictures["wrist[2]"], one[COLUMNS["wrist"]][0, 2].permute(1, 2, 0))
+    figure = query.picture(policy, question, reply)
+    assert [axes.get_title() for axes in figure.axes][-3:] == list(reply.pictures)
+    figure.savefig(tmp_path / "answer.png")

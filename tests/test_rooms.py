@@ -49,6 +49,7 @@ FLOORS = [
     "lerobot_unimask/plots/answers.py",
     "lerobot_unimask/plots/curves.py",
     "lerobot_unimask/plots/heatmaps.py",
+    "lerobot_unimask/plots/thumbnails.py",
     "lerobot_unimask/sharing/cards.py",
     "lerobot_unimask/sharing/hub.py",
     "lerobot_unimask/modeling_unimask.py",

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from lerobot_unimask.asking.given import check_picture
 from lerobot_unimask.data.factors import Camera
 from lerobot_unimask.data.window import Window, as_tensor
-from lerobot_unimask.language.masks import Token
+from lerobot_unimask.language.masks import Mask, Token
 
 Key = TypeVar("Key", Token, tuple[str, int])
 
@@ -73,3 +73,20 @@ def observed_pictures(model: LookingModel, batch: Mapping[str, Any], batch_size:
         check_picture(f"The picture of {camera.key!r}", pictures)
         tokens[name] = look(model, name, pictures)
     return tokens
+
+
+def shown_pictures(
+    model: LookingModel, window: Window | None, mask: Mask, given: Mapping[Token, Tensor]
+) -> dict[str, Tensor]:
+    """Token -> (H, W, C), from 0 to 1: the pictures of the first window that a question shows, in the order of time."""
+    found = {}
+    for step in range(next(iter(mask.shown.values())).shape[1]):
+        for name in model.cameras:
+            if mask.shown[name][0, step]:
+                token = Token(name, step)
+                recorded = None if window is None else window.values[name][:, step]
+                picture = given.get(token, recorded)
+                if picture is not None:
+                    scale = 255 if picture.dtype == torch.uint8 else 1
+                    found[str(token)] = (picture[0].float() / scale).permute(1, 2, 0).clamp(0, 1).cpu()
+    return found
