@@ -14,6 +14,7 @@ from lerobot_unimask.commands import (
     measure,
     paper,
     prepare,
+    pretrained,
     push,
     query,
     serve,
@@ -21,7 +22,7 @@ from lerobot_unimask.commands import (
 )
 from lerobot_unimask.commands.flags import Parser, check_dataset
 
-COMMANDS = (demo, build, prepare, query, given, validate, measure, push, frames, serve, bench, paper)
+COMMANDS = (demo, build, prepare, pretrained, query, given, validate, measure, push, frames, serve, bench, paper)
 
 
 def make_parser() -> Parser:
@@ -47,7 +48,8 @@ def main(argv: list[str] | None = None) -> None:
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         check_dataset(arguments)
-        importlib.import_module("lerobot_policy_unimask")  # as LeRobot's own commands do
+        if not getattr(arguments, "light", False):
+            importlib.import_module("lerobot_policy_unimask")  # as LeRobot's own commands do
         arguments.run(arguments)
     except KeyboardInterrupt:
         sys.exit("unimask: interrupted")

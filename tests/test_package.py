@@ -39,6 +39,8 @@ def run_outside(code: str, installed: Path, cwd: Path) -> str:
 def test_the_wheel_holds_the_three_packages_and_no_more(installed: Path) -> None:
     packages = {path.parent.relative_to(installed).parts[0] for path in installed.rglob("*.py")}
     assert packages == {"lerobot_unimask", "lerobot_policy_unimask", "dataset_builders"}
+    policies = {path.parent.name for path in installed.glob("lerobot_unimask/pretrained/*/model.safetensors")}
+    assert policies == {"doorkey", "maze2d"}
 
 
 def test_lerobot_discovers_the_wheel_and_makes_policy_and_environment_by_name(installed: Path, tmp_path: Path) -> None:

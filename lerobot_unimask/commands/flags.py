@@ -5,6 +5,8 @@ import difflib
 from pathlib import Path
 from typing import Any
 
+from lerobot_unimask.pretrained import FOLDERS
+
 
 class Parser(argparse.ArgumentParser):
     """argparse that says which flag was probably meant."""
@@ -49,7 +51,10 @@ def boolean(text: str) -> bool:
 
 def policy_flags(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     """`--policy.path` and `--policy.revision`, as `arguments.path` (a list of `several`) and `arguments.revision`."""
-    what = "a checkpoint, a lerobot-train output folder, of which the last checkpoint counts, or a Hub repository"
+    what = (
+        "a checkpoint, a lerobot-train output folder, of which the last checkpoint counts, a Hub repository, or the "
+        f"name of a policy that comes with the package: {' or '.join(FOLDERS)}"
+    )
     if several:
         parser.add_argument(
             "--policy.path",

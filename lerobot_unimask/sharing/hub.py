@@ -31,6 +31,7 @@ from lerobot.datasets.utils import get_safe_version
 from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
 from lerobot_unimask.data.checkpoints import last_checkpoint
+from lerobot_unimask.pretrained import FOLDERS
 from lerobot_unimask.records import read_json
 
 
@@ -46,9 +47,12 @@ class Origin(NamedTuple):
 
 
 def find_policy(name_or_path: str | Path, *, revision: str | None = None, **download: Any) -> Path:
-    """The folder of a policy's files: of a checkpoint, of a training's last one, or of what `fetch` gets."""
+    """The folder of a policy's files: of a checkpoint, of a training's last one, of a policy that comes with the
+    package, or of what `fetch` gets."""
     folder = Path(name_or_path)
-    return last_checkpoint(folder) if folder.is_dir() else fetch(str(name_or_path), revision=revision, **download)
+    if folder.is_dir():
+        return last_checkpoint(folder)
+    return FOLDERS.get(str(name_or_path)) or fetch(str(name_or_path), revision=revision, **download)
 
 
 def fetch(repo_id: str, *, revision: str | None = None, **download: Any) -> Path:
