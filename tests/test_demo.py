@@ -16,7 +16,7 @@ import pytest
 from lerobot_unimask import UniMASKPolicy, demo
 from lerobot_unimask.language.masks import TASKS
 
-FILES = {"demo.json", "five_panels.png", "state_distributions.png"}
+PICTURES = {"five_panels.png", "trained_five_panels.png", "trained_state_distributions.png"}
 QUESTIONS = {"imitation", "imitation, sampled actions"}
 SECONDS = 4 * 60
 BYTES = 4 * 10**9
@@ -24,21 +24,17 @@ BYTES = 4 * 10**9
 
 def check_files(output: Path) -> dict:
     """What every demo leaves behind; returns its record."""
-    assert {path.name for path in output.iterdir()} >= FILES
-    for picture in ("five_panels.png", "state_distributions.png"):
+    assert {path.name for path in output.iterdir()} >= {"demo.json", *PICTURES}
+    for picture in PICTURES:
         assert (output / picture).stat().st_size > 10_000
     assert UniMASKPolicy.from_pretrained(output / "train/checkpoints/last/pretrained_model")
     assert list((output / "eval").rglob("*.mp4"))
     record = json.loads((output / "demo.json").read_text())
     assert record["rollouts"].keys() == QUESTIONS
     assert record["loss_on_unseen_episodes"].keys() == TASKS.keys()
-    assert [panel["name"] for panel in record["panels"]] == [
-        "Imitation",
-        "Another goal",
-        "A wanted return",
-        "A waypoint",
-        "Backwards",
-    ]
+    names = ["Imitation", "Another goal", "A wanted return", "A waypoint", "Backwards"]
+    for panels in ("shipped_panels", "panels"):
+        assert [panel["name"] for panel in record[panels]] == names
     assert record["state_distributions"]["shown"] == [0, 3, 6]
     return record
 
@@ -83,7 +79,8 @@ def test_every_number_that_is_printed_is_recorded(small: tuple[Path, dict, str])
     output, record, printed = small
     printed = printed.partition("What to try next:")[0]
     results = [line.replace(str(output), "") for line in printed.splitlines() if re.match(r" {2,}\S", line)]
-    known = recorded(record) | {100 * panel["share"] for panel in record["panels"] if panel["share"] is not None}
+    asked = [*record["shipped_panels"], *record["panels"]]
+    known = recorded(record) | {100 * panel["share"] for panel in asked if panel["share"] is not None}
     for line in results:
         for number in numbers_in(line):
             decimals = len(number.partition(".")[2])
@@ -96,7 +93,7 @@ def test_the_commands_to_try_next_name_what_is_there(small: tuple[Path, dict, st
     _, _, advice = printed.partition("What to try next:")
     assert [word for word in ("lerobot-eval", "lerobot-train", "unimask validate") if word not in advice] == []
     paths = re.findall(rf"{re.escape(str(output))}[\w/.-]*", advice)
-    assert len(paths) == 5
+    assert len(paths) == 6
     assert [path for path in paths if not Path(path).exists()] == []
 
 
@@ -151,6 +148,6 @@ def test_the_full_demo_is_quick_and_small_and_answers_well(tmp_path: Path) -> No
     assert most < BYTES
     assert record["seconds"] <= seconds
     assert record["rollouts"]["imitation"]["success_percent"] > 60  # at most 84; the expert itself succeeds in 7
-    achieved = {panel["name"]: panel["achieved"] for panel in record["panels"]}
+    achieved = {panel["name"]: panel["achieved"] for panel in record["shipped_panels"]}
     assert achieved["Imitation"]["success"] == [True]
     assert achieved["Another goal"]["s[-1] reached"] == [True]
