@@ -93,7 +93,7 @@ def test_the_commands_to_try_next_name_what_is_there(small: tuple[Path, dict, st
     _, _, advice = printed.partition("What to try next:")
     assert [word for word in ("lerobot-eval", "lerobot-train", "unimask validate") if word not in advice] == []
     paths = re.findall(rf"{re.escape(str(output))}[\w/.-]*", advice)
-    assert len(paths) == 6
+    assert len(paths) == 5
     assert [path for path in paths if not Path(path).exists()] == []
 
 

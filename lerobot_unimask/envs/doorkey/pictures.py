@@ -205,7 +205,7 @@ def _outcome(panel: Panel) -> str:
     if "possible histories" in panel.achieved:
         found = panel.achieved["possible histories"]
         words.append(f"{found} possible histories" if found else "no possible history found")
-    drawn = [] if panel.share is None else [f"drawn actions: {panel.share:.0%}"]
+    drawn = [] if panel.share is None else [f"{panel.share:.0%} of drawn rollouts"]
     return "\n".join([", ".join(words), *drawn])
 
 
