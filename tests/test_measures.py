@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from safetensors.torch import load_file
-from torch.distributions import Categorical, Normal, kl_divergence
+from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal, kl_divergence
 
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
@@ -94,6 +94,29 @@ def test_divergences_are_those_of_torch():
     torch.testing.assert_close(gaussian, kl_divergence(*normals).sum(-1))
     unit = _divergence(p, q, Output((Component("a", slice(0, 4), None),)))
     torch.testing.assert_close(unit, kl_divergence(Normal(p, 1.0), Normal(q, 1.0)).sum(-1))
+
+
+def test_a_divergence_of_mixtures_is_that_of_their_draws():
+    """Of mixtures whose Gaussians are all the same, in closed form."""
+    torch.manual_seed(0)
+    p, q = torch.randn(2, 20, 4) / 2
+    output = Output((Component("a", slice(0, 2), None),), gaussians=3)
+    wholes = [
+        output.pack(torch.randn(20, 3), *(x[:, None, i : i + 2].expand(-1, 3, -1) for i in (0, 2))) for x in (p, q)
+    ]
+    normals = [Normal(x[:, :2], x[:, 2:].exp()) for x in (p, q)]
+    expected = kl_divergence(*normals).sum(-1)
+    torch.testing.assert_close(_divergence(*wholes, output).mean(), expected.mean(), atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("head", ["gaussian", "mixture"])
+def test_the_density_ahead_is_that_of_the_answers_gaussians(head, make, root):
+    policy = make(continuous_head=head)
+    batch = windows(policy, root)
+    said = policy.infer(batch, "s[7] | s[:6], a[:5]").distributions["s"][0]
+    normals = Independent(Normal(said.means[:, 7], said.scales[:, 7]), 1)
+    density = MixtureSameFamily(Categorical(said.weights[:, 7]), normals).log_prob(batch["observation.state"][:, 7])
+    assert error_ahead(policy, batch, 2)["log_density"] == pytest.approx(density.mean().item(), rel=1e-4)
 
 
 def test_directions_that_say_the_same_disagree_by_nothing(make, root):

@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType
 from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from policies import CONTINUOUS_STATS, assert_unchanged, without_return
+from policies import CONTINUOUS_STATS, assert_same_answers, assert_unchanged, without_return
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -192,6 +192,27 @@ def test_the_parts_of_a_loss_survive_mixed_precisions_wrapper(tiny_policy, doork
     plain, wrapped = policy(doorkey_batch)[1], convert_outputs_to_fp32(policy.forward)(doorkey_batch)[1]
     assert dict(plain) == dict(wrapped)
     assert all(isinstance(part, float) for part in plain.values())
+
+
+def test_a_policy_with_a_mixture_learns_is_saved_answers_draws_and_acts(tiny_policy, continuous_batch, tmp_path):
+    policy = tiny_policy("gaussian", continuous_head="mixture", mixture_components=3)
+    policy.train()
+    optimiser = torch.optim.Adam(policy.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(20):
+        loss, _ = policy.forward(continuous_batch)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+    policy.save_pretrained(tmp_path)
+    loaded = UniMASKPolicy.from_pretrained(tmp_path)
+    assert_same_answers(*(one.eval().infer(continuous_batch, "future", t=3) for one in (policy, loaded)))
+    drawn = loaded.sample(continuous_batch, "s[3] | s[:3]", samples=2).values["s"][:, 3]
+    assert drawn.isfinite().all()
+    observation = {"observation.state": continuous_batch["observation.state"][:, 0]}
+    assert loaded.select_action(observation).shape == (5, 2)
 
 
 def test_padding_does_not_matter_to_the_loss(tiny_policy, continuous_batch):

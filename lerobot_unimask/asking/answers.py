@@ -150,7 +150,7 @@ class ContinuousDistribution:
 
     def log_density(self, values: Tensor) -> Tensor:
         """That of the values of tokens, in nats and the dataset's units: (B, K, D) -> (B, K)."""
-        return self._log_densities(values[..., self.output.numbers].unsqueeze(-2)).logsumexp(-1)[..., 0]
+        return self._log_densities(values[..., self.output.dims].unsqueeze(-2)).logsumexp(-1)[..., 0]
 
     def marginals(self) -> "list[ContinuousDistribution]":
         """One for each component."""
@@ -217,7 +217,10 @@ class Answer:
         if len(parts) == 1:
             return parts[0]
         numbers = [number for distribution in self.distributions[factor] for number in distribution.output.numbers]
-        return torch.cat(parts, dim=-1)[..., sorted(range(len(numbers)), key=numbers.__getitem__)]
+        tokens = torch.cat(parts, dim=-1)
+        return (
+            tokens if numbers == sorted(numbers) else tokens[..., sorted(range(len(numbers)), key=numbers.__getitem__)]
+        )
 
 
 def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None) -> Answer:
@@ -245,7 +248,7 @@ def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None)
                 weights, means, scales = model.statistics.denormalise(name, output, prediction)
                 first = torch.zeros_like(weights).index_fill_(-1, torch.tensor(0, device=weights.device), 1.0)
                 weights = torch.where(known, torch.where(shown, first, weights), torch.nan)
-                value = window.values[name][..., output.numbers].unsqueeze(-2)
+                value = window.values[name][..., output.dims].unsqueeze(-2)
                 here, there = shown.unsqueeze(-1), known.unsqueeze(-1)  # (B, K, 1, 1)
                 means = torch.where(there, torch.where(here, value, means), torch.nan)
                 if scales is not None:

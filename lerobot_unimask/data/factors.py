@@ -99,6 +99,12 @@ class Output:
         return [number for component in self.components for number in range(component.dims.start, component.dims.stop)]
 
     @property
+    def dims(self) -> slice | list[int]:
+        """The numbers as an index; a run of them as a slice, which no GPU has to be told of."""
+        first, last = self.numbers[0], self.numbers[-1]
+        return slice(first, last + 1) if last - first == len(self.numbers) - 1 else self.numbers
+
+    @property
     def categories(self) -> tuple[int, ...]:
         """Of each discrete component."""
         return tuple(component.categories for component in self.components if component.categories is not None)

@@ -296,7 +296,7 @@ class Statistics(nn.Module):
     def denormalise(self, name: str, output: Output, prediction: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """A prediction of one continuous output, (..., size), as weights (..., n), means and scales (..., n, d) of n
         Gaussians, in the dataset's units; the scales are None where the head predicts none."""
-        mean, std = (self.get_buffer(f"{name}_{part}")[output.numbers] for part in ("mean", "std"))
+        mean, std = (self.get_buffer(f"{name}_{part}")[output.dims] for part in ("mean", "std"))
         logits, means, scales = output.unpack(prediction)
         return logits.softmax(-1), means * std + mean, scales.exp() * std if output.gaussians else None
 

@@ -55,7 +55,7 @@ def output_loss(prediction: Tensor, value: Tensor, output: Output) -> Tensor:
     """
     if output.discrete:
         return functional.cross_entropy(prediction.transpose(1, 2), output.combination(value), reduction="none")
-    target = value[..., output.numbers]
+    target = value[..., output.dims]
     if output.gaussians:
         logits, means, scales = output.unpack(prediction)
         surprise = (target.unsqueeze(-2) - means) * (-scales).exp()

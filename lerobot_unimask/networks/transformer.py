@@ -127,7 +127,7 @@ class Transformer(nn.Module):
             ahead = course(states, shown["s"], causal)
             for i, output in self.on_course.items():
                 logits, means, scales = output.unpack(predictions["s"][i])
-                means = means + ahead[..., output.numbers].unsqueeze(-2)
+                means = means + ahead[..., output.dims].unsqueeze(-2)
                 predictions["s"][i] = output.pack(logits, means, scales)
         return predictions
 
