@@ -79,6 +79,16 @@ def test_doorkeys_answers_are_near_the_optimum():
         assert apart < 0.08 * optimum["expected_losses"][task] + 0.005, task
 
 
+def test_doorkeys_card_says_what_was_measured():
+    card = (FOLDERS["doorkey"] / "README.md").read_text()
+    found = json.loads((ROOT / "docs/results/doorkey_pretrained.json").read_text())
+    for task, apart in found["runs"][0]["divergence"].items():
+        assert f"| `{task}` | {found['optimum']['expected_losses'][task]:.3f} | {apart:.3f} |" in card
+    rules = json.loads((ROOT / "docs/results/doorkey_pretrained_acts.json").read_text())["rules"]
+    assert f"{rules['most_likely']['success']:.1%}".replace("%", " %") in card
+    assert f"sampled ones return {rules['sampled']['mean_return']:.2f}" in card
+
+
 def test_maze2d_acts_as_its_card_says():
     result = evaluate(FOLDERS["maze2d"], "maze2d", 20, batch_size=20, seed=1000)
     assert result["mean_return"] == pytest.approx(2.46, abs=4 * result["standard_error"])
