@@ -48,7 +48,7 @@ def test_processes_with_unequal_token_counts_have_the_loss_and_gradients_of_one(
     policy = tiny_policy(training_masks=masks).train()
     loss, parts = policy.forward(doorkey_batch)
     gradients = torch.autograd.grad(loss, list(policy.parameters()), allow_unused=True)
-    batches = [{key: value[part] for key, value in doorkey_batch.items()} for part in (slice(0, 3), slice(3, 8))]
+    batches = [{key: value[part] for key, value in doorkey_batch.items()} for part in (slice(0, 1), slice(1, 8))]
     apart = [policy.forward(batch)[0].item() for batch in batches]
     assert abs(sum(apart) / 2 - loss.item()) > 1e-3  # each over its own tokens would be another loss
 
