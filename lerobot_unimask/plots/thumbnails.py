@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from lerobot_unimask.plots.style import SMALL
 
@@ -21,7 +22,7 @@ def add_thumbnails(figure: Figure, pictures: Mapping[str, np.ndarray]) -> None:
     figure.set_size_inches(width, height + HEIGHT)
     share = HEIGHT / (height + HEIGHT)
     layout = figure.get_layout_engine()
-    if layout is not None:
+    if isinstance(layout, ConstrainedLayoutEngine):
         layout.set(rect=(0, 0, 1, 1 - share))
     each = 1 / max(len(tokens), 6)
     for i, token in enumerate(tokens):
