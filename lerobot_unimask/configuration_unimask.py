@@ -366,6 +366,8 @@ class UniMASKConfig(PreTrainedConfig):
                 )
         if wanted and self.network != "transformer":
             raise ValueError(f"network={self.network} reads no cameras: leave them out with --policy.cameras=[].")
+        if wanted and self.compile_model:
+            raise ValueError("compile_model reads no cameras: choose --policy.cameras=[] or leave it out.")
         return list(wanted)
 
     def _named_cameras(self, entries: dict[str, dict[str, Any]], taken: Iterable[str]) -> dict[str, Camera]:
