@@ -29,7 +29,7 @@ SETTINGS = {
     "device": "cpu", "context_length": K, "image_size": [48, 48], "training_masks": [GOAL, IMITATION],
     "inference_mask": IMITATION, "width": 128, "depth": 2, "heads": 4, "feedforward_width": 256, "dropout": 0.0,
 }  # fmt: skip
-EPISODES, UPDATES, BATCH, ROLLOUTS, SEED = 500, 3000, 64, 200, 0
+EPISODES, UPDATES, BATCH, ROLLOUTS, SEED = 500, 2000, 64, 200, 0
 
 
 def reached(policy, states, **question) -> float:

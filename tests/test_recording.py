@@ -100,6 +100,7 @@ def test_cameras_that_are_not_read_are_not_decoded(train, monkeypatch, tmp_path)
     assert set(decoded) == {"observation.images.phone"}
 
 
+@pytest.mark.slow
 def test_uncached_it_learns_the_same(train, tmp_path):
     losses = {}
     original = UniMASKPolicy.forward
