@@ -199,3 +199,13 @@ def test_doorkey_does_what_it_is_asked():
     assert asked["consistency"]["shown_values_changed"] == 0
     for share in ("asked_to", "asked_not_to"):
         assert f"{asked['visits'][share]:.1%}" in PAGES
+
+
+@pytest.mark.parametrize("task", ["peg", "pick", "door", "drawer"])
+def test_the_default_acts_on_the_arm_as_the_page_says(task):
+    found, perceptron = record(f"arm_{task}_policy.json"), record(f"arm_{task}_perceptron.json")
+    acts, seconds = found["remembers"]["10"]["success"], found["train_processor_seconds"]
+    assert found["training"]["settings"] == {"mask_seed": 0}
+    assert acts >= 0.95 - 1e-6
+    assert acts > max(run["success"] for run in perceptron["updates"].values()) - 0.05
+    assert f"{100 * acts:.0f} ({100 * found['remembers']['10']['standard_error']:.0f}), {seconds:.0f} s" in PAGES
