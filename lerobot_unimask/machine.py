@@ -3,11 +3,14 @@
 import ctypes
 import os
 import platform
+import threading
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
+
+BUSY = 1.5  # processes that wanted a core in the last minute: this one, and another
 
 
 def has_bfloat16(device: str) -> bool:
@@ -27,6 +30,32 @@ def keep_freed_memory() -> bool:
         return False
     libc, trim_threshold, mmap_threshold = ctypes.CDLL(None), -1, -3  # as in malloc.h
     return bool(libc.mallopt(mmap_threshold, 2**25) and libc.mallopt(trim_threshold, 10**9))
+
+
+@cache
+def wait_without_spinning() -> bool:
+    """Where other processes want the cores too, let PyTorch's threads sleep while they wait for each other. libgomp has
+    them spin for milliseconds, while the one waited for may have no core: updates then take many times as long
+    (docs/speed.md). With more threads than cores it spins a three-hundredth of that, so here is one more, asleep. What
+    the environment says of waiting is left as it is. Does nothing the second time.
+
+    Returns:
+        Whether it was done.
+    """
+    told, maps = {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys(), Path("/proc/self/maps")
+    if told or torch.get_num_threads() == 1 or not maps.exists() or "libgomp" not in maps.read_text():
+        return False
+    if os.getloadavg()[0] < BUSY:
+        return False
+    started = threading.Event()
+
+    def sleep() -> None:
+        torch.zeros(2**20).exp_()  # a thread that computes has threads of its own
+        started.set()
+        threading.Event().wait()
+
+    threading.Thread(target=sleep, daemon=True).start()
+    return started.wait(timeout=10)
 
 
 def describe_machine() -> dict[str, Any]:

@@ -34,7 +34,7 @@ from lerobot_unimask.data.taking_over import take_over
 from lerobot_unimask.data.window import Statistics, Window, frame_index, make_window, read_batch, task_column
 from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
-from lerobot_unimask.machine import keep_freed_memory
+from lerobot_unimask.machine import keep_freed_memory, wait_without_spinning
 from lerobot_unimask.networks import make_network
 from lerobot_unimask.networks.layers import Cache, Predictions, joined
 from lerobot_unimask.networks.losses import LossParts
@@ -139,9 +139,11 @@ class UniMASKPolicy(PreTrainedPolicy):
         return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
 
     def train(self, mode: bool = True) -> "UniMASKPolicy":
-        """As PyTorch's; on a processor, training begins with glibc told to keep freed memory."""
+        """As PyTorch's; on a processor, training begins with glibc told to keep freed memory, and with threads
+        that do not spin where other processes want the cores."""
         if mode and self.device.type == "cpu":
             keep_freed_memory()
+            wait_without_spinning()
         return super().train(mode)
 
     def update(self) -> None:

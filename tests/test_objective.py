@@ -81,9 +81,7 @@ def pair(tiny_policy, kind, **settings):
     return captured, eager
 
 
-@pytest.mark.parametrize(
-    "settings", [pytest.param(s, id=n, marks=pytest.mark.slow if n != "both" else ()) for n, s in NETWORKS.items()]
-)
+@pytest.mark.parametrize("settings", [pytest.param(s, id=n, marks=pytest.mark.slow) for n, s in NETWORKS.items()])
 @alone
 def test_an_update_is_one_graph_with_eagers_losses(tiny_policy, batch_of, capture, settings):
     graphs = capture("aot_eager")
@@ -93,6 +91,17 @@ def test_an_update_is_one_graph_with_eagers_losses(tiny_policy, batch_of, captur
     assert len(graphs) == 1
 
 
+def test_a_loss_is_one_graph(tiny_policy, batch_of, capture):
+    """Without a backward pass, which would keep this process from forking trainings."""
+    graphs = capture("eager")
+    captured, eager = pair(tiny_policy, "gaussian")
+    with torch.no_grad():
+        losses = [policy.train()(batch_of("gaussian"))[0] for policy in (captured, eager)]
+    torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-4)
+    assert len(graphs) == 1
+
+
+@pytest.mark.slow
 @alone
 def test_a_batch_that_does_not_fit_runs_eagerly(tiny_policy, batch_of, capture):
     graphs = capture("eager")
@@ -109,6 +118,7 @@ def test_a_batch_that_does_not_fit_runs_eagerly(tiny_policy, batch_of, capture):
     assert len(graphs) == 1
 
 
+@pytest.mark.slow
 @alone
 def test_a_captured_policy_is_saved_loaded_and_copied(tiny_policy, batch_of, capture, tmp_path):
     capture("eager")

@@ -92,6 +92,7 @@ FLOORS = [
     "lerobot_unimask/query.py",
     "lerobot_unimask/bench/clock.py",
     "lerobot_unimask/bench/measuring.py",
+    "lerobot_unimask/bench/device.py",
     "lerobot_unimask/bench/tables.py",
     "lerobot_unimask/demo.py",
     "lerobot_unimask/paper/study.py",

@@ -2,8 +2,8 @@
 
 Every measurement runs in a process of its own, so that its peak memory is its own. These processes are forked from one
 that has imported everything and computed nothing; what such a process occupies is in the record as `imports`. Weights
-are untrained, which costs the same. With a GPU, clocks wait for it and its peak memory is recorded too; that has not
-been tried for want of one.
+are untrained, which costs the same. With a GPU, clocks wait for it and its peak memory is recorded too; what a GPU
+itself does is measured by `device.py`.
 """
 
 import os
@@ -106,11 +106,7 @@ def bench(configs: Path, *, quick: bool = False) -> dict[str, Any]:
     Raises:
         FileNotFoundError: it does not hold them.
     """
-    missing = [name for name in CONFIGS.values() if not (configs / name).exists()]
-    if missing:
-        raise FileNotFoundError(
-            f"{configs} holds no {' and no '.join(missing)}: give the repository's folder of configs."
-        )
+    check_configs(configs)
     size = QUICK if quick else FULL
     began, load = time.monotonic(), os.getloadavg()[0]
     record: dict[str, Any] = {
@@ -155,6 +151,18 @@ def bench(configs: Path, *, quick: bool = False) -> dict[str, Any]:
         record["growth"] = _growth(size, settings["maze2d"]["policy"], Path(folder))
     record["seconds"] = round(time.monotonic() - began)
     return record
+
+
+def check_configs(configs: Path) -> None:
+    """
+    Raises:
+        FileNotFoundError: the folder does not hold the configs that are measured.
+    """
+    missing = [name for name in CONFIGS.values() if not (configs / name).exists()]
+    if missing:
+        raise FileNotFoundError(
+            f"{configs} holds no {' and no '.join(missing)}: give the repository's folder of configs."
+        )
 
 
 def _training(size: Size, configs: Path, roots: Mapping[str, Path]) -> dict[str, Any]:
@@ -245,19 +253,8 @@ def training(
     lerobot_train.cycle = timed_cycle
     if not batched_reads:
         LeRobotDataset.__getitems__ = None  # in this process, which measures nothing else
-    with tempfile.TemporaryDirectory() as folder:
-        overrides = {
-            "dataset.root": root,
-            "dataset.eval_split": 0,
-            "steps": updates + WARM_UP + 1,  # the last one's end is not seen
-            "eval_steps": 0,
-            "env_eval_freq": 0,
-            "save_checkpoint": "false",
-            "output_dir": Path(folder) / "run",
-        }
-        flags = [f"--{name}={value}" for name, value in overrides.items()]
-        with sdpa_kernel(SDPBackend.MATH) if explicit_attention else nullcontext():
-            lerobot_train.train(draccus.parse(TrainPipelineConfig, config, args=[*flags, *arguments]))
+    with sdpa_kernel(SDPBackend.MATH) if explicit_attention else nullcontext():
+        run_lerobot_train(config, root, updates + WARM_UP + 1, arguments)  # the last one's end is not seen
     step = np.diff(watch.began["data"])
     piece = {name: np.array(seconds[: len(step)]) for name, seconds in watch.seconds.items()}
     pieces = {
@@ -275,6 +272,22 @@ def training(
         "share": {name: seconds[WARM_UP:].sum() / counted.sum() for name, seconds in pieces.items()},
         "threads": torch.get_num_threads(),
     }
+
+
+def run_lerobot_train(config: Path, root: Path, steps: int, arguments: Sequence[str]) -> None:
+    """lerobot-train's own function in this process, without checkpoints and evaluations."""
+    with tempfile.TemporaryDirectory() as folder:
+        overrides = {
+            "dataset.root": root,
+            "dataset.eval_split": 0,
+            "steps": steps,
+            "eval_steps": 0,
+            "env_eval_freq": 0,
+            "save_checkpoint": "false",
+            "output_dir": Path(folder) / "run",
+        }
+        flags = [f"--{name}={value}" for name, value in overrides.items()]
+        lerobot_train.train(draccus.parse(TrainPipelineConfig, config, args=[*flags, *arguments]))
 
 
 def acting(name: str, settings: Mapping[str, Any], root: Path, environments: int, calls: int) -> dict[str, Any]:
