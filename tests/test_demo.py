@@ -148,6 +148,8 @@ def test_the_full_demo_is_quick_and_small_and_answers_well(tmp_path: Path) -> No
     assert most < BYTES
     assert record["seconds"] <= seconds
     assert record["rollouts"]["imitation"]["success_percent"] > 60  # at most 84; the expert itself succeeds in 7
-    achieved = {panel["name"]: panel["achieved"] for panel in record["shipped_panels"]}
-    assert achieved["Imitation"]["success"] == [True]
-    assert achieved["Another goal"]["s[-1] reached"] == [True]
+    shipped = {panel["name"]: panel for panel in record["shipped_panels"]}
+    assert shipped["Imitation"]["achieved"]["success"] == [True]
+    assert shipped["A waypoint"]["achieved"]["s[3] reached"] == [True]
+    assert shipped["A wanted return"]["share"] > 0.9
+    assert shipped["Another goal"]["share"] > 0.4  # its most likely actions miss

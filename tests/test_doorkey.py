@@ -413,6 +413,7 @@ def test_build_makes_a_dataset_that_lerobot_loads(tmp_path, monkeypatch):
         "beta": 1.0,
         "seed": 3,
         "episodes": 20,
+        "camera": False,
         "package_version": None,
         "command": None,
     }

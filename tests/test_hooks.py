@@ -179,6 +179,7 @@ def test_columns_that_cannot_be_states_are_refused(tiny_policy, states):
 
 
 def test_lerobots_page_about_ffmpeg_is_one_line_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, logger="lerobot.utils.import_utils")
     for _ in range(2):
         logging.getLogger("lerobot.utils.import_utils").warning(
             "A page.\nOf it.\nIt reads by pyav (see the error above)."

@@ -14,6 +14,7 @@ import pytest
 from hub_server import Hub
 
 from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask.configuration_unimask import FORMAT_VERSION
 
 FLOW = Path(__file__).with_name("hub_flow.py")
 
@@ -183,5 +184,5 @@ def test_a_folder_without_a_checkpoint_is_named(tmp_path: Path) -> None:
 
 
 def test_a_saved_config_has_the_format(checkpoint: Path) -> None:
-    assert json.loads((checkpoint / "config.json").read_text())["format_version"] == 2
-    assert UniMASKPolicy.from_pretrained(checkpoint).config.format_version == 2
+    assert json.loads((checkpoint / "config.json").read_text())["format_version"] == FORMAT_VERSION
+    assert UniMASKPolicy.from_pretrained(checkpoint).config.format_version == FORMAT_VERSION

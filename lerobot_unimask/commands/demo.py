@@ -9,7 +9,11 @@ from lerobot_unimask.commands.flags import add_command, positive
 
 
 def add(commands: Any) -> None:
-    parser = add_command(commands, "demo", "build, train, evaluate and question a DoorKey model in about nine minutes")
+    parser = add_command(
+        commands,
+        "demo",
+        "ask the policy that comes with the package, then train another and ask it too: about four minutes",
+    )
     parser.add_argument("--output", type=Path, default=Path("unimask-demo"), help="folder to write to; new or empty")
     parser.add_argument("--steps", type=positive, default=None, help="training updates, for a shorter or longer demo")
     parser.set_defaults(run=_run)
