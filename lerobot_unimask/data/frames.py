@@ -33,7 +33,7 @@ _own = threading.local()  # each thread's decoders: one decoder serves one threa
 
 
 def frames_folder() -> Path:
-    return HF_LEROBOT_HOME / "unimask_frames"
+    return HF_LEROBOT_HOME / "unimask" / "frames"
 
 
 def stored_files(folder: Path | None = None) -> list[tuple[Path, int]]:
