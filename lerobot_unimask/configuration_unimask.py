@@ -51,7 +51,7 @@ TOKEN_LAYOUTS = ("stacked", "separate")
 DISCRETE_HEADS = ("joint", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian", "mixture")
 UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
-FINE_FROM = 500  # episodes; fewer are learnt by heart from sines and cosines (docs/arm.md)
+FINE_FROM = 500  # episodes of a task; fewer are learnt by heart from sines and cosines (docs/arm.md)
 # More is a damaged file, or a slip
 MOST = {"mixture_components": 64, "width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
 
@@ -138,7 +138,7 @@ class UniMASKConfig(PreTrainedConfig):
     fine_inputs: bool | None = None
     """Whether continuous values are read with displacements, sines and cosines, which tell places apart that are close
     together, but let a network learn few episodes by heart; False: as plain numbers, the paper's. None: where the
-    dataset has 500 episodes or more."""
+    dataset has 500 episodes or more for each of its tasks."""
     state_residuals: bool = True
     """Whether continuous states are predicted as departures from the straight course of those shown; False: as plain
     values, the paper's."""

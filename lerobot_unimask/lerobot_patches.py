@@ -98,6 +98,7 @@ def _read_as_this_policy_needs() -> None:
         if cfg.trainable_config.type == "unimask" and both[1] is not None:  # opened anew, each with its episodes
             for part in both:
                 reads.read_cameras(part, cfg.trainable_config, opened[0])
+            cfg.eval_steps = cfg.eval_steps or cfg.steps
         opened.clear()
         return both
 

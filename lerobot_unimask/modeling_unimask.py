@@ -20,6 +20,7 @@ from torch import Tensor
 from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_return, observed_state, plan_from
 from lerobot_unimask.asking.answers import Answer, answer
 from lerobot_unimask.asking.given import Given
+from lerobot_unimask.asking.held_out import HeldOutActions
 from lerobot_unimask.asking.looking import observed_pictures
 from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.predicting import predict
@@ -43,6 +44,8 @@ from lerobot_unimask.objective import CapturedLoss, batch_loss
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 from lerobot_unimask.records import read_json
 from lerobot_unimask.sharing import cards, hub
+
+logger = logging.getLogger(__name__)
 
 
 class UniMASKPolicy(PreTrainedPolicy):
@@ -75,7 +78,9 @@ class UniMASKPolicy(PreTrainedPolicy):
         if dataset_meta is not None and TASK not in config.features:
             config.add_tasks(list(dataset_meta.tasks.index))
         if config.fine_inputs is None:
-            config.fine_inputs = dataset_meta is None or dataset_meta.total_episodes >= FINE_FROM
+            config.fine_inputs = (
+                dataset_meta is None or dataset_meta.total_episodes >= FINE_FROM * dataset_meta.total_tasks
+            )
         self.factors = config.make_factors()
         self.cameras = config.pictures
         check_settings(config, self.factors)
@@ -92,6 +97,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         self.network = make_network(config, self.factors, load_backbone=load_backbone)
         self._batch_loss = CapturedLoss() if config.compile_model else batch_loss
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
+        self._held_out = HeldOutActions()  # since it was last trained
         self._loss: Tensor | None = None  # of the last batch that was trained on
         self.origin: hub.Origin | None = None  # where it was loaded from
         self.folder: Path | None = None  # of the files that were loaded, on this machine
@@ -132,15 +138,21 @@ class UniMASKPolicy(PreTrainedPolicy):
             The scalar loss, or (B,) whose mean it is; and each factor's part in it for the log.
         """
         window = self.make_window(batch)
-        step = self.updates if self.training else VALIDATION_STEP
-        loss, losses = self._batch_loss(self, window, frame_index(batch, window), step, reduction)
+        step, index = self.updates if self.training else VALIDATION_STEP, frame_index(batch, window)
+        loss, losses = self._batch_loss(self, window, index, step, reduction)
         if self.training:
             self._loss = loss.detach().mean()
+        else:
+            self._held_out.add(self, window, index)
         return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
 
     def train(self, mode: bool = True) -> "UniMASKPolicy":
         """As PyTorch's; on a processor, training begins with glibc told to keep freed memory, and with threads
-        that do not spin where other processes want the cores."""
+        that do not spin where other processes want the cores. What lies between two trainings is an evaluation of
+        held-out episodes, of which this then says how far acting is from repeating the last action."""
+        if mode and (line := self._held_out.line(self)):
+            logger.info(line)
+        self._held_out = HeldOutActions()
         if mode and self.device.type == "cpu":
             keep_freed_memory()
             wait_without_spinning()

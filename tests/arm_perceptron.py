@@ -1,13 +1,9 @@
 """The least that a user would expect of MetaWorld's arm: a perceptron, squared error, one observation to one action.
 
-    OMP_NUM_THREADS=1 uv run python tests/arm_perceptron.py --root=DATA --output=docs/results/FILE.json
-
-Two hidden layers of 256, Adam, 128 frames an update, a rate that falls to 0 along a cosine. Episodes start as in
-`tests/arm.py`.
+Two hidden layers of 256, Adam, 128 frames an update, a rate that falls to 0 along a cosine. `tests/arm_tasks.py` runs
+it.
 """
 
-import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -17,10 +13,7 @@ import pyarrow.parquet as parquet
 import torch
 from torch import Tensor, nn
 
-from lerobot_unimask.data.episodes import provenance_of
 from lerobot_unimask.envs.metaworld.environment import HORIZON, MetaWorldEnv
-from lerobot_unimask.machine import describe_machine
-from lerobot_unimask.records import versions, write_json
 
 
 def read(root: Path) -> tuple[Tensor, Tensor]:
@@ -64,45 +57,18 @@ def success(network: nn.Module, task: str, episodes: int, seed: int, normalise: 
     return {"success": share, "standard_error": (share * (1 - share) / episodes) ** 0.5, "episodes": episodes}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--root", type=Path, required=True, help="a dataset of `unimask build metaworld`")
-    parser.add_argument("--updates", default="5000,20000", help="a training for each; default: %(default)s")
-    parser.add_argument("--rate", type=float, default=1e-3)
-    parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=0, help="of weights and batches; default: %(default)s")
-    parser.add_argument("--starts", type=int, default=100_000, help="seed of the first start; default: %(default)s")
-    parser.add_argument("--output", type=Path, required=True)
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    observations, actions = read(arguments.root)
+def run(root: Path, task: str, seed: int, updates: int, episodes: int, starts: int) -> dict[str, Any]:
+    """Train a perceptron on a dataset and roll it out."""
+    observations, actions = read(root)
     mean, deviation = observations.mean(0), observations.std(0).clamp_min(1e-6)
 
     def normalise(x: Tensor) -> Tensor:
         return (x - mean) / deviation
 
-    task, found = provenance_of(arguments.root)["task"], {}
-    for updates in map(int, arguments.updates.split(",")):
-        began = time.process_time()
-        network = train(normalise(observations), actions, updates, arguments.seed, arguments.rate)
-        seconds = time.process_time() - began
-        found[str(updates)] = {
-            "train_processor_seconds": round(seconds, 1),
-            **success(network, task, arguments.episodes, arguments.starts, normalise),
-        }
-        print("updates", updates, json.dumps(found[str(updates)]), flush=True)
-    write_json(
-        arguments.output,
-        {
-            "what": "share of successful episodes from unseen starts of a perceptron of two layers of 256, by updates",
-            "task": task,
-            "command": {name: str(value) for name, value in vars(arguments).items()},
-            "updates": found,
-            "machine": describe_machine(),
-            "versions": versions("metaworld"),
-        },
-    )
-
-
-if __name__ == "__main__":
-    main()
+    began = time.process_time()
+    network = train(normalise(observations), actions, updates, seed, rate=1e-3)
+    seconds = time.process_time() - began
+    return {
+        "train_processor_seconds": round(seconds, 1),
+        **success(network, task, episodes, starts, normalise),
+    }

@@ -84,9 +84,12 @@ def test_several_tasks_make_one_dataset(root, tmp_path):
     assert provenance_of(both)["failures"].keys() == {TASK, "stick-push-v3"}
 
 
-@pytest.mark.parametrize(("least", "fine"), [(EPISODES, True), (EPISODES + 1, False)])
-def test_few_episodes_are_read_as_plain_numbers(root, monkeypatch, least, fine):
+@pytest.mark.parametrize(
+    ("least", "tasks", "fine"), [(EPISODES, 1, True), (EPISODES + 1, 1, False), (EPISODES, 2, False)]
+)
+def test_few_episodes_of_a_task_are_read_as_plain_numbers(root, monkeypatch, least, tasks, fine):
     monkeypatch.setattr("lerobot_unimask.modeling_unimask.FINE_FROM", least)
+    monkeypatch.setattr(LeRobotDatasetMetadata, "total_tasks", tasks)
     config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16)
     policy = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/arm", root=root))
     assert policy.config.fine_inputs is fine
@@ -94,11 +97,12 @@ def test_few_episodes_are_read_as_plain_numbers(root, monkeypatch, least, fine):
 
 
 def test_it_trains_and_is_evaluated_by_lerobots_loops(root, tmp_path):
-    """Videos apart, for which there may be no display."""
+    """Videos apart, for which there may be no display. What is held out is evaluated at the end."""
     small = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
     data = ["--dataset.repo_id=local/arm", f"--dataset.root={root}"]
     flags = ["--policy.type=unimask", "--policy.push_to_hub=false", *small, "--steps=2", "--batch_size=4"]
-    commands.check("lerobot-train", *flags, *data, "--env_eval_freq=0", "--output_dir=run", cwd=tmp_path)
+    flags += ["--dataset.eval_split=0.3", "--env_eval_freq=0", "--output_dir=run"]
+    assert commands.check("lerobot-train", *flags, *data, cwd=tmp_path).count("held-out steps acting misses") == 1
     checkpoint = tmp_path / "run/checkpoints/last/pretrained_model"
     found = rollout(checkpoint, "metaworld_state", 2, batch_size=2, seed=0, environment={"task": TASK})
     assert found["episodes"] == 2

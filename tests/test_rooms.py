@@ -44,6 +44,7 @@ FLOORS = [
     "lerobot_unimask/asking/memory.py",
     "lerobot_unimask/asking/sampling.py",
     "lerobot_unimask/asking/acting.py",
+    "lerobot_unimask/asking/held_out.py",
     "lerobot_unimask/asking/questions.py",
     "lerobot_unimask/plots/style.py",
     "lerobot_unimask/plots/answers.py",

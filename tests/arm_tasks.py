@@ -1,0 +1,104 @@
+"""The default policy on tasks of MetaWorld's arm, one for each task or one for all, beside a perceptron.
+
+    OMP_NUM_THREADS=1 uv run python tests/arm_tasks.py --roots=data/peg,data/hammer --seeds=0,1 \
+        --output=docs/results/FILE.json
+
+Trained as lerobot-train does, then rolled out from unseen starts, the same for every model and seed. Each run stands in
+the record as soon as it is done, and what stands there is not run again. A setting can be changed:
+`--settings='{"context_length": 3}'`. A dataset of several tasks makes one policy that is told the task.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import arm_perceptron
+import torch
+from arm import success
+
+import lerobot_policy_unimask  # noqa: F401 (registers)
+from lerobot_unimask.data.episodes import provenance_of, read_info
+from lerobot_unimask.envs.metaworld.environment import OBJECT, MetaWorldEnv
+from lerobot_unimask.machine import describe_machine
+from lerobot_unimask.records import read_json, versions, write_json
+from lerobot_unimask.training import Trainer
+
+KEPT = ("context_length", "n_obs_steps", "training_masks", "causal_share", "fine_inputs", "continuous_head", "dropout")
+
+
+def policy_runs(root: Path, seed: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """One policy trained on a dataset, and its success on each of the dataset's tasks."""
+    settings = {"mask_seed": seed, **arguments.settings}
+    trainer = Trainer(settings, root, seed=seed, steps=arguments.updates, batch_size=arguments.batch_size)
+    began = time.process_time()
+    for _ in trainer:
+        pass
+    spent = time.process_time() - began
+    policy = trainer.policy.eval()
+    if arguments.save is not None:
+        policy.save_pretrained(arguments.save / f"{root.name}_{seed}")
+    facts = {"updates": arguments.updates, "train_processor_seconds": round(spent, 1), **trainer.record()}
+    facts |= {"policy": {name: getattr(policy.config, name) for name in KEPT}}
+    tasks, found = provenance_of(root)["task"].split(","), []
+    objects = read_info(root)["features"]["observation.environment_state"]["shape"][0] // OBJECT
+    for task in tasks:
+        envs = [MetaWorldEnv(task, objects, render_mode=None) for _ in range(arguments.episodes)]
+        found.append({"task": task, **facts, **success(policy, envs, arguments.starts)})
+    return found
+
+
+def perceptron_runs(root: Path, seed: int, updates: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """A perceptron trained on a dataset of one task, and its success."""
+    task = provenance_of(root)["task"]
+    facts = arm_perceptron.run(root, task, seed, updates, arguments.episodes, arguments.starts)
+    return [{"task": task, "updates": updates, **facts}]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--roots", required=True, help="datasets of `unimask build metaworld`, comma-separated")
+    parser.add_argument("--seeds", default="0,1", help="of weights, batches and masks; default: %(default)s")
+    parser.add_argument("--settings", type=json.loads, default={}, help="of the policy; default: none changed")
+    parser.add_argument("--updates", type=int, default=2000, help="of the policy; default: %(default)s")
+    parser.add_argument("--batch_size", type=int, default=64)
+    parser.add_argument("--perceptron", default="5000,20000", help="its updates, a run for each; default: %(default)s")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--starts", type=int, default=100_000, help="seed of the first start; default: %(default)s")
+    parser.add_argument("--save", type=Path, help="folder for the policies, NAME_SEED; default: none is kept")
+    parser.add_argument("--output", type=Path, required=True)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    record: dict[str, Any] = {
+        "what": "share of successful episodes from unseen starts, most likely actions",
+        "command": {name: str(value) for name, value in vars(arguments).items() if value is not None},
+        "machine": describe_machine(),
+        "versions": versions("metaworld"),
+        "runs": read_json(arguments.output)["runs"] if arguments.output.exists() else [],
+    }
+    wanted = [
+        (model, Path(root), int(seed), int(updates))
+        for seed in arguments.seeds.split(",")
+        for root in arguments.roots.split(",")
+        for model, updates in [
+            ("unimask", arguments.updates),
+            *(("perceptron", updates) for updates in filter(None, arguments.perceptron.split(","))),
+        ]
+    ]
+    for model, root, seed, updates in wanted:
+        names = {"model": model, "data": root.name, "seed": seed}
+        if any(run["updates"] == updates and names.items() <= run.items() for run in record["runs"]):
+            continue
+        if model == "unimask":
+            found = policy_runs(root, seed, arguments)
+        else:
+            found = perceptron_runs(root, seed, updates, arguments)
+        record["runs"] += [{**names, **run} for run in found]
+        write_json(arguments.output, record)
+        for run in found:
+            print(model, root.name, seed, run["task"], updates, run["success"], run["train_processor_seconds"])
+
+
+if __name__ == "__main__":
+    main()
