@@ -182,6 +182,8 @@ class UniMASKConfig(PreTrainedConfig):
     """Weight decay of AdamW."""
     optimizer_grad_clip_norm: float = 1.0
     """Norm to which gradients are clipped."""
+    use_amp: bool = False
+    """Whether training computes in bfloat16; on a processor that has no such arithmetic it stays with float32."""
     compile_model: bool = False
     """Whether torch.compile captures what an update computes up to its loss, and the way back: some 20 to 60 s at the
     start, and on a GPU a few launches for each update instead of hundreds."""
@@ -219,7 +221,7 @@ class UniMASKConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.use_amp and not has_bfloat16(self.device):
+        if self.use_amp and not has_bfloat16(str(self.device)):
             logger.warning("use_amp does not help here: this processor has no bfloat16 arithmetic. Using float32.")
             self.use_amp = False
         if not 1 <= self.context_length <= MAX_CONTEXT:

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from dataset_builders.doorkey import build_doorkey
-from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.answers import Answer, DiscreteDistribution
 from lerobot_unimask.data.episodes import first_windows, open_dataset
 from lerobot_unimask.envs.doorkey.panels import DRAWN, Panel, five_panels, predicted_states
 from lerobot_unimask.envs.doorkey.pictures import draw_panels, state_distributions
@@ -226,9 +226,10 @@ def _steps_made(log: Path) -> int:
 
 def _states(answer: Answer) -> dict:
     """Each step's distribution of agent and key, and which steps were shown."""
+    parts = (part for part in answer["s"] if isinstance(part, DiscreteDistribution))
     return {
         "shown": answer.mask.shown["s"][0].nonzero().flatten().tolist(),
-        **{part.name: torch.round(part.probabilities[0], decimals=4).tolist() for part in answer["s"]},
+        **{part.name: torch.round(part.probabilities[0], decimals=4).tolist() for part in parts},
     }
 
 

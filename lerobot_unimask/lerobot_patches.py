@@ -106,7 +106,7 @@ def _read_as_this_policy_needs() -> None:
     factory.make_train_eval_datasets = make_train_eval_datasets
     for name in ("lerobot.datasets", "lerobot.scripts.lerobot_train"):  # where LeRobot has imported it by name
         if name in sys.modules:
-            sys.modules[name].make_train_eval_datasets = make_train_eval_datasets
+            vars(sys.modules[name])["make_train_eval_datasets"] = make_train_eval_datasets
 
 
 def _say_in_a_line_what_decodes() -> None:

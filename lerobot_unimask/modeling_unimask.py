@@ -91,7 +91,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             config.training_masks,
             tuple(self.factors),
             config.context_length,
-            causal_share={"bidirectional": 0.0, "both": config.causal_share, "causal": 1.0}[config.attention],
+            causal_share=config.causal_share if config.attention == "both" else float(config.attention == "causal"),
             cameras=tuple(self.cameras),
         )
         self.network = make_network(config, self.factors, load_backbone=load_backbone)
@@ -182,7 +182,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """What the network puts out for each asked token; see `asking.predicting.predict`."""
         return predict(self, window, mask, cache)
 
-    def make_window(self, batch: Mapping[str, Tensor], *, partial: bool = False) -> Window:
+    def make_window(self, batch: Mapping[str, Any], *, partial: bool = False) -> Window:
         """A LeRobot batch as a window of this model, in the dataset's units; see `data.window.make_window`."""
         if TASK in self.factors and TASK in batch:
             batch = {**batch, TASK: task_column(batch[TASK], self.factors[TASK], self.config.context_length)}
@@ -268,7 +268,7 @@ class UniMASKPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(
         self,
-        batch: dict[str, Tensor],
+        batch: dict[str, Any],
         *,
         mask: str | None = None,
         given: Given | None = None,
@@ -306,7 +306,7 @@ class UniMASKPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def predict_action_chunk(
         self,
-        batch: dict[str, Tensor],
+        batch: dict[str, Any],
         inference_delay: int = 0,
         prev_chunk_left_over: Tensor | None = None,
         **kwargs: Any,

@@ -26,7 +26,7 @@ from lerobot_unimask.asking.sampling import Check, Samples
 from lerobot_unimask.data.episodes import episode_numbers, provenance_of, read_window
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.envs import environment_of_states
-from lerobot_unimask.envs.record import Environment, check_expert
+from lerobot_unimask.envs.record import Environment, optimum_of
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import ASKABLE, TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
@@ -158,11 +158,10 @@ def ask(
         raise ValueError(f"Values for {windows} windows are given; give one value for each token.")
     best = None
     if exact is not None:
-        environment = _environment(policy)
-        check_expert(environment, exact, provenance_of(source.folder) if source else {})
+        optimum = optimum_of(_environment(policy), exact, provenance_of(source.folder) if source else {})
         window, shown = pose_question(policy, recorded, mask, t, given)
         cpu = torch.device("cpu")
-        best = environment.exact_answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
+        best = optimum.answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
     own = read_given(given or {}, policy.factors, policy.config.context_length, 1, policy.cameras)
     return Reply(question, answer, recorded, best, shown_pictures(policy, recorded, question, own))
 
@@ -184,7 +183,7 @@ def make_check(policy: UniMASKPolicy, name: str, start: int = 0) -> Check:
             f"The environment of this policy, whose states are {', '.join(policy.number_names['s'])}, offers no check "
             f"{name!r}; it offers {known or 'none'}."
         )
-    return environment.make_check(name, start)
+    return environment.checks[name](start)
 
 
 def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
@@ -222,8 +221,8 @@ def _of_marginals(answer: Answer, name: str, step: int, i: int) -> dict[str, Any
     if isinstance(distribution, ContinuousDistribution):
         at = i - distribution.component.dims.start
         scale = None if distribution.scale is None else distribution.scale[0, step, at].item()
-        said = {"mean": distribution.mean[0, step, at].item(), "scale": scale}
-        if distribution.output.gaussians > 1:
+        said: dict[str, Any] = {"mean": distribution.mean[0, step, at].item(), "scale": scale}
+        if distribution.scales is not None and distribution.output.gaussians > 1:
             means, scales = (part[0, step, :, at].tolist() for part in (distribution.means, distribution.scales))
             said |= {"weights": distribution.weights[0, step].tolist(), "means": means, "scales": scales}
         return said

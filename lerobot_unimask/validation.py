@@ -14,10 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lerobot_unimask.asking.answers import DiscreteDistribution
 from lerobot_unimask.data.checkpoints import checkpoints_of, episodes_trained_on, training_settings
 from lerobot_unimask.data.episodes import first_windows, open_dataset, provenance_of
 from lerobot_unimask.envs import environment_of_states
-from lerobot_unimask.envs.record import check_expert
+from lerobot_unimask.envs.record import optimum_of
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS
 from lerobot_unimask.language.training_masks import validation_masks
@@ -66,7 +67,7 @@ def probability_of_truth(policy: UniMASKPolicy, batch: dict[str, Tensor], text: 
     for name, distributions in answer.distributions.items():
         asked = mask.asked[name]
         token = torch.ones(int(asked.sum()), device=policy.device)
-        for distribution in distributions:
+        for distribution in (part for part in distributions if isinstance(part, DiscreteDistribution)):
             token = token * distribution.probability(window.values[name].nan_to_num())[asked]
         probabilities.append(token)
     return torch.cat(probabilities).mean().item()
@@ -108,9 +109,8 @@ def validate(
                 model = policy.config.context_length, policy.config.features
                 dataset = open_dataset(policy.config, root, repo_id)
                 provenance = provenance_of(Path(dataset.root))
-                environment = environment_of_states(policy.number_names["s"])
                 if exact is not None:
-                    check_expert(environment, exact, provenance)
+                    exact_optimum = optimum_of(environment_of_states(policy.number_names["s"]), exact, provenance)
                 batch = first_windows(dataset)
                 masks = answered(policy, batch)
             elif model != (policy.config.context_length, policy.config.features):
@@ -142,7 +142,7 @@ def validate(
     values = {task: [result["losses"][task] for result in results] for task in tasks}
     optimum: dict[str, Any] = {}
     if exact is not None:
-        optimum["optimum"], distances = environment.beside_optimum(chosen, batch, tasks, exact)
+        optimum["optimum"], distances = exact_optimum.compare(chosen, batch, tasks, exact)
         lowest = optimum["optimum"]["losses"]
         for result, distance in zip(results, distances, strict=True):
             result["above_optimum"] = {task: loss - lowest[task] for task, loss in result["losses"].items()}

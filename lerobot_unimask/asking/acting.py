@@ -44,6 +44,10 @@ class ActingModel(Model, LookingModel, Protocol):
     config: UniMASKConfig
     episode_starts: EpisodeStarts
 
+    def make_window(self, batch: Mapping[str, Any], *, partial: bool = False) -> Window:
+        """A LeRobot batch in the dataset's units."""
+        ...
+
 
 def act(
     model: ActingModel,

@@ -23,8 +23,10 @@ from lerobot_unimask.networks.layers import Cache, Predictions
 class Model(Protocol):
     """What answers are made of: `UniMASKPolicy` is one, and so is an environment's exact optimum."""
 
-    factors: Mapping[str, Factor]
     statistics: Statistics
+
+    @property
+    def factors(self) -> Mapping[str, Factor]: ...
 
     def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
         """A network's outputs for a window of normalised values."""
@@ -143,6 +145,8 @@ class ContinuousDistribution:
 
     def _log_densities(self, x: Tensor) -> Tensor:
         """Those of each Gaussian, times its weight, at m places for each step: (B, K, m, d) -> (B, K, m, n)."""
+        if self.scales is None:
+            raise ValueError("An L2 head's answers have no density.")
         scales = self.scales.clamp_min(1e-12)
         surprise = (x.unsqueeze(-2) - self.means.unsqueeze(-3)) / scales.unsqueeze(-3)
         logs = -(surprise.square() / 2 + math.log(2 * math.pi) / 2 + scales.log().unsqueeze(-3)).sum(-1)
@@ -157,14 +161,15 @@ class ContinuousDistribution:
         if len(self.output.components) == 1:
             return [self]
         sizes = [len(part.numbers) for part in self.output.apart]
-        pairs = zip(self.output.apart, self.means.split(sizes, -1), self.scales.split(sizes, -1), strict=True)
-        return [ContinuousDistribution(part, self.weights, *of_numbers) for part, *of_numbers in pairs]
+        scales = [None] * len(sizes) if self.scales is None else self.scales.split(sizes, -1)
+        parts = zip(self.output.apart, self.means.split(sizes, -1), scales, strict=True)
+        return [ContinuousDistribution(part, self.weights, mean, scale) for part, mean, scale in parts]
 
     def at(self, rows: Tensor, step: int) -> "ContinuousDistribution":
         """That of some windows, (n,) their numbers, at one step: (n, 1, ...)."""
-        here = [part[rows, step : step + 1] for part in (self.weights, self.means)]
-        scales = None if self.scales is None else self.scales[rows, step : step + 1]
-        return ContinuousDistribution(self.output, *here, scales)
+        here = rows, slice(step, step + 1)
+        scales = None if self.scales is None else self.scales[here]
+        return ContinuousDistribution(self.output, self.weights[here], self.means[here], scales)
 
     def draw(self, generator: torch.Generator | None) -> Tensor:
         """One sample for each step, (B, K, d): of one Gaussian, drawn by its weight; an L2 head's is its mean."""

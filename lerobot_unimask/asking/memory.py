@@ -45,7 +45,7 @@ class RolloutMemory:
         sizes = {name: factor.size for name, factor in factors.items()} | dict(cameras or {})
         self.values = {name: torch.zeros(batch_size, K, size, device=device) for name, size in sizes.items()}
         self.return_so_far = torch.full((batch_size, K), torch.nan, device=device)
-        self.first_state: Tensor | None = None  # (B, D)
+        self.first_state = self.values["s"][:, 0]  # (B, D) of the episode's first step, once that is observed
         self.task: str | Sequence[str] | None = None  # what each environment is to do, as it says at this step
         self.planned: list[Tensor] = []  # actions of a chunk that are still to be carried out, each (B, D)
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
@@ -82,8 +82,8 @@ class RolloutMemory:
         if self.step == 0:
             self.first_state = state
         self.values["s"][:, self.position] = state
-        for name in self.cameras:
-            self.values[name][:, self.position] = pictures[name].clone()
+        for name, token in (pictures or {}).items():
+            self.values[name][:, self.position] = token.clone()
         self.return_so_far[:, self.position] = torch.nan if return_so_far is None else return_so_far
 
     @torch.inference_mode(False)

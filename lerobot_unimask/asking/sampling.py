@@ -49,7 +49,7 @@ def sample(
     mask: Mask,
     *,
     order: str,
-    generator: torch.Generator,
+    generator: torch.Generator | None,
     check: Check | None = None,
     tries: int = 100,
 ) -> Samples:
@@ -64,6 +64,7 @@ def sample(
 
     Args:
         order: `forward` in time (s0, a0, s1, ...), `backward`, or `random` (one order for the whole batch).
+        generator: source of the draws, on the window's device; None: torch's global one.
         check: tells which samples contradict themselves; called after each drawn token with the samples that drew it.
         tries: how often one token is drawn before its sample starts over, and how often a sample starts before all is
             given up.
@@ -80,7 +81,7 @@ def sample(
     if order == "backward":
         tokens.reverse()
     elif order == "random":
-        shuffle = torch.randperm(len(tokens), generator=generator, device=generator.device).tolist()
+        shuffle = torch.randperm(len(tokens), generator=generator, device=window.valid.device).tolist()
         tokens = [tokens[i] for i in shuffle]
     shown = {
         name: torch.where(mask.shown[name].unsqueeze(-1), value, torch.nan) for name, value in window.values.items()

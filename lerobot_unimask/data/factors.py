@@ -228,7 +228,7 @@ def flat_names(names: Any) -> list[str]:
     """Names as `info.json` has them, some nested one deep: `[["a", "b"]]`, `{"motors": ["a", "b"]}`."""
     if isinstance(names, Mapping):
         names = list(names.values()) if any(isinstance(part, list) for part in names.values()) else list(names)
-    flat = []
+    flat: list[Any] = []
     for part in names if isinstance(names, list | tuple) else []:
         flat += part if isinstance(part, list | tuple) else [part]
     return [str(name) for name in flat]
@@ -304,10 +304,11 @@ def group_features(
         ValueError: a column is missing, or cannot be what it is named as.
     """
     columns = [key for key in found if key.startswith(OBS_PREFIX) and key != RETURN_TO_GO]
-    for key in states or ():
-        if key not in columns or list(states).count(key) > 1:
+    if states is None:
+        states = [key for key in (STATE, ENVIRONMENT_STATE) if key in found]
+    for key in states:
+        if key not in columns or states.count(key) > 1:
             raise ValueError(f"states names {key!r}; name each of its columns once, of {', '.join(columns) or 'none'}.")
-    states = [key for key in (STATE, ENVIRONMENT_STATE) if key in found] if states is None else list(states)
     taken = (*states, STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are no properties
     if not states:
         raise ValueError(

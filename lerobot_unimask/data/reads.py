@@ -171,7 +171,7 @@ _columns: WeakKeyDictionary[datasets.Dataset, Columns | None] = WeakKeyDictionar
 class Rows:
     """Some frames of a camera, in another order, without copying them."""
 
-    frames: np.ndarray  # (N, C, H, W)
+    frames: "np.ndarray | Rows"  # (N, C, H, W)
     rows: np.ndarray
 
     def __getitem__(self, index: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.utils.constants import HF_LEROBOT_HOME
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 SEEN = HF_LEROBOT_HOME / "unimask" / "sound"  # markers of datasets that have been looked through
@@ -69,7 +70,7 @@ def _describe(path: Path, key: str, names: Sequence[str], bad: np.ndarray, value
     )
 
 
-def check_statistics(key: str, names: Sequence[str], known: Mapping[str, np.ndarray]) -> None:
+def check_statistics(key: str, names: Sequence[str], known: Mapping[str, ArrayLike]) -> None:
     """
     Args:
         known: `mean` and `std` of a column, (D,) each.

@@ -213,7 +213,12 @@ class Statistics(nn.Module):
 
     Discrete numbers and computed ones keep mean 0 and standard deviation 1, so that one rule serves every factor. Until
     `fill` is called, nothing is scaled.
+
+    `horizon` is the number of steps of the longest episode, `fps` how many there are in a second.
     """
+
+    horizon: Tensor
+    fps: Tensor
 
     def __init__(self, features: Mapping[str, Sequence[Feature]], factors: Mapping[str, Factor], context_length: int):
         super().__init__()
@@ -221,7 +226,7 @@ class Statistics(nn.Module):
         for name, factor in factors.items():
             self.register_buffer(f"{name}_mean", torch.zeros(factor.size))
             self.register_buffer(f"{name}_std", torch.ones(factor.size))
-        self.register_buffer("horizon", torch.tensor(float(context_length)))  # steps of the longest episode
+        self.register_buffer("horizon", torch.tensor(float(context_length)))
         self.register_buffer("fps", torch.tensor(1.0))
 
     def fill(self, dataset_stats: Mapping[str, Mapping[str, Any]], *, root: Path | None = None) -> None:

@@ -195,10 +195,10 @@ def tabulate(text: str, factors: tuple[str, ...], context_length: int, cameras: 
             raise MaskError(f"{term.factor}{kind} can be shown but never asked; ask for s or a.", text, term.position)
     rows: list[tuple[int, Tensor, Tensor]] = []
     for t in range(context_length) if question.uses_t else (-1,):
+        if not _admits(question.terms, context_length, t):
+            continue
         asked = _select(question.asked, factors, cameras, context_length, t, text)
         shown = _select(question.shown, factors, cameras, context_length, t, text)
-        if asked is None or shown is None:
-            continue  # an integer index falls outside the window at this t
         asked[len(factors) :] = False  # of all that is observed, `s` asks for the numbers
         asked &= ~shown  # what is shown is not asked
         if asked.any():
@@ -232,11 +232,15 @@ def _own_factor(name: str, factors: Sequence[str]) -> str:
     return "s" if name == STATE and STATE not in factors else name
 
 
-def _select(
-    terms: Sequence[Term], factors: Sequence[str], cameras: Sequence[str], K: int, t: int, text: str
-) -> Tensor | None:
-    """The tokens that `terms` name at this t, (F, K) bool, `s` those of every camera too; None where an integer rules
-    this t out."""
+def _admits(terms: Sequence[Term], K: int, t: int) -> bool:
+    """Whether no integer with t falls outside the window."""
+    return all(
+        0 <= part.value + t < K for term in terms for part in term.steps if isinstance(part, Index) and part.relative
+    )
+
+
+def _select(terms: Sequence[Term], factors: Sequence[str], cameras: Sequence[str], K: int, t: int, text: str) -> Tensor:
+    """The tokens that `terms` name at a t that they admit, (F, K) bool, `s` those of every camera too."""
     names = (*factors, *cameras)
     chosen = torch.zeros(len(names), K, dtype=torch.bool)
     for term in terms:
@@ -248,8 +252,6 @@ def _select(
                 steps = range(*bounds.indices(K))
             else:
                 step = part.value + t if part.relative else part.value
-                if part.relative and not 0 <= step < K:
-                    return None
                 if not -K <= step < K:
                     raise MaskError(
                         f"Step {step} lies outside the window: its steps are 0 to {K - 1} (or -{K} to -1).",

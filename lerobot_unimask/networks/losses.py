@@ -3,6 +3,7 @@
 Legend of shapes: B windows, K steps, D the dimensions of a factor.
 """
 
+import functools
 import math
 from collections.abc import Iterator, MutableMapping
 from typing import Any
@@ -118,9 +119,7 @@ def masked_losses(
             pairs = [
                 pair for whole, output in pairs for pair in zip(marginals(whole, output), output.apart, strict=True)
             ]
-        costs = (output_loss(prediction, value, output) * here for prediction, output in pairs)  # each (B, K)
-        if reduction == "none":
-            losses[name] = sum(cost.sum(1) * (len(here) / count) for cost in costs)
-        else:
-            losses[name] = sum(cost.sum() / count for cost in costs)
+        costs = (output_loss(prediction, value, output) * here for prediction, output in pairs)
+        cost = functools.reduce(torch.add, costs)  # (B, K)
+        losses[name] = cost.sum() / count if reduction == "mean" else cost.sum(1) * (len(here) / count)
     return losses

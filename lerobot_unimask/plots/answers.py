@@ -81,7 +81,6 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
     heights = [0.5 + 0.13 * min(d.component.categories or 12, 20) for _, d in rows]
     figure = Figure(figsize=(WIDTH, 0.9 + sum(heights)), layout="constrained")
     grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
-    probability = ScalarMappable(Normalize(0, 1), "Blues")
     for axes, (name, distribution) in zip(grid, rows, strict=True):
         recorded = None
         if truth is not None:
@@ -89,7 +88,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
             recorded = np.where(truth.valid[window].numpy(force=True)[:, None], recorded, np.nan)
         shown = answer.mask.shown[name][window].numpy(force=True)  # (K,)
         if isinstance(distribution, DiscreteDistribution):
-            _draw_heat_map(axes, distribution, recorded, shown, probability, window)
+            _draw_heat_map(axes, distribution, recorded, shown, window)
         else:
             _draw_bands(axes, distribution, recorded, shown, window)
         axes.set_ylabel(f"{name}: {distribution.name}", fontsize=SMALL + 1)
@@ -97,6 +96,7 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
     K = answer.mask.shown["s"].shape[1]
     grid[-1].set(xlim=(-0.5, K - 0.5), xlabel="step", xticks=range(0, K, max(1, K // 20)))
     if any(isinstance(d, DiscreteDistribution) for _, d in rows):
+        probability = ScalarMappable(Normalize(0, 1), "Blues")
         colorbar = figure.colorbar(probability, ax=list(grid), shrink=0.8, aspect=25, pad=0.01)
         colorbar.set_label("probability", fontsize=SMALL + 1)
         colorbar.ax.tick_params(labelsize=SMALL, length=2)
@@ -107,17 +107,12 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
 
 
 def _draw_heat_map(
-    axes: Axes,
-    distribution: DiscreteDistribution,
-    recorded: np.ndarray | None,
-    shown: np.ndarray,
-    colours: ScalarMappable,
-    window: int,
+    axes: Axes, distribution: DiscreteDistribution, recorded: np.ndarray | None, shown: np.ndarray, window: int
 ) -> None:
     """Categories upwards, steps to the right; what is neither shown nor asked stays grey."""
     probabilities = distribution.probabilities[window].numpy(force=True)  # (K, categories)
     axes.set_facecolor(HIDDEN["facecolor"])
-    axes.imshow(probabilities.T, cmap=colours.cmap, norm=colours.norm, aspect="auto", origin="lower")
+    axes.imshow(probabilities.T, cmap="Blues", vmin=0, vmax=1, aspect="auto", origin="lower")
     for step in np.flatnonzero(shown):
         at = int(probabilities[step].argmax())
         axes.add_patch(Rectangle((step - 0.5, at - 0.5), 1, 1, fill=False, edgecolor=PURPLE, linewidth=1.6))

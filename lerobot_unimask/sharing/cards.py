@@ -7,12 +7,12 @@ import html
 import io
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from textwrap import dedent, indent
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -223,8 +223,20 @@ def _results(results: Sequence[Mapping[str, Any]]) -> list[str]:
     return parts
 
 
-class Described(Protocol):
-    """What a dataset's card asks of its environment; `envs.record.Environment` is one."""
+Provenance = Mapping[str, Any]  # what a dataset's folder says of how it was built
+
+
+@dataclass(frozen=True)
+class Described:
+    """What a dataset's card says of its environment.
+
+    Attributes:
+        type: its name in `--env.type=`.
+        horizon: steps of an episode.
+        description: sentences; so are `expert` and `reward`.
+        columns: meaning of each of its own columns.
+        draw_episodes: picture of the first episodes' states, (N, T, D).
+    """
 
     type: str
     horizon: int
@@ -232,10 +244,7 @@ class Described(Protocol):
     expert: str
     reward: str
     columns: Mapping[str, str]
-
-    def draw_episodes(self, states: np.ndarray, provenance: Mapping[str, Any]) -> Figure:
-        """A picture of episodes' states, (N, T, D)."""
-        ...
+    draw_episodes: Callable[[np.ndarray, Provenance], Figure]
 
 
 COLUMNS = {
@@ -307,9 +316,7 @@ def dataset_card(root: Path, repo_id: str, environment: Described | None = None)
     return {"README.md": text.encode(), **files}
 
 
-def _draw_episodes(
-    root: Path, info: Mapping[str, Any], provenance: Mapping[str, Any], environment: Described
-) -> Figure:
+def _draw_episodes(root: Path, info: Mapping[str, Any], provenance: Provenance, environment: Described) -> Figure:
     """The first episodes, all of one length."""
     length = environment.horizon
     path = root / info["data_path"].format(chunk_index=0, file_index=0)

@@ -90,8 +90,8 @@ class _DoorKeyGrid(MiniGridEnv):
     def state(self) -> tuple[int, int, bool]:
         """(agent cell, key cell, door open)."""
         agent = int(cell_at(*self.agent_pos))
-        key = agent if self.carrying else int(cell_at(*self.key.cur_pos))
-        return agent, key, self.door.is_open
+        place = None if self.carrying else self.key.cur_pos
+        return agent, agent if place is None else int(cell_at(*place)), self.door.is_open
 
 
 def _position(cell: int) -> tuple[int, int]:

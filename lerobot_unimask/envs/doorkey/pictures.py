@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.path import Path
 
-from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.answers import Answer, DiscreteDistribution
 from lerobot_unimask.envs.doorkey.panels import Panel, given_states
 from lerobot_unimask.envs.doorkey.rules import CELLS, DOOR, GOAL, coordinates
 from lerobot_unimask.plots.style import (
@@ -239,14 +239,14 @@ def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
     likelier. Shown states have a frame.
 
     Args:
-        answer: To a question about `s`, with probabilities for every step, as `experiments.gridworld.predicted_states`
-            gives.
+        answer: To a question about `s`, with probabilities for every step, as `predicted_states` gives.
         window: Which of the answer's windows.
 
     Raises:
         ValueError: The answer says nothing about some steps.
     """
-    agent, key = (distribution.probabilities[window].numpy(force=True) for distribution in answer["s"])  # (K, 16) each
+    parts = (part for part in answer["s"] if isinstance(part, DiscreteDistribution))
+    agent, key = (part.probabilities[window].numpy(force=True) for part in parts)  # (K, 16) each
     shown = answer.mask.shown["s"][window].tolist()
     silent = np.flatnonzero(np.isnan(agent).any(axis=1)).tolist()
     if silent:

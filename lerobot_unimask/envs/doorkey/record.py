@@ -5,18 +5,14 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from matplotlib.figure import Figure
 
 from lerobot_unimask.asking.answers import Answer
-from lerobot_unimask.asking.sampling import Check, Samples
+from lerobot_unimask.asking.sampling import Samples
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.envs.doorkey.comparison import beside_optimum
 from lerobot_unimask.envs.doorkey.optimum import exact_answer
 from lerobot_unimask.envs.doorkey.pictures import state_distributions, trajectories
 from lerobot_unimask.envs.doorkey.rules import ENV_ID, HORIZON, DynamicsCheck
-from lerobot_unimask.envs.record import Environment, Provenance
+from lerobot_unimask.envs.record import Environment, ExactOptimum, Provenance
 from lerobot_unimask.language.masks import Mask
-
-
-def _make_check(name: str, first_step: int) -> Check:
-    return DynamicsCheck(agree=name == "agreement", first_step=first_step)
 
 
 def _draw_answer(
@@ -49,9 +45,9 @@ DOORKEY = Environment(
     },
     draw_episodes=_draw_episodes,
     draw_answer=_draw_answer,
-    checks=("dynamics", "agreement"),
-    make_check=_make_check,
-    experts=("paper", "released"),
-    exact_answer=exact_answer,
-    beside_optimum=beside_optimum,
+    checks={
+        "dynamics": lambda first_step: DynamicsCheck(first_step=first_step),
+        "agreement": lambda first_step: DynamicsCheck(agree=True, first_step=first_step),
+    },
+    optimum=ExactOptimum(("paper", "released"), answer=exact_answer, compare=beside_optimum),
 )

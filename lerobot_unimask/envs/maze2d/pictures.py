@@ -1,17 +1,27 @@
 """Maze2D: where the model thinks the mass is, over the maze's walls."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch
 
-from lerobot_unimask.asking.answers import Answer
+from lerobot_unimask.asking.answers import Answer, ContinuousDistribution
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.envs.maze2d.maze import BODY_OFFSET, WALL_OFFSET, parse_maze
-from lerobot_unimask.plots.style import BLUE, FAINT, GREEN, NORMAL, PURPLE, SMALL, VERMILLION, WALL, WIDTH, square
+from lerobot_unimask.plots.style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    NORMAL,
+    PURPLE,
+    SMALL,
+    VERMILLION,
+    WALL,
+    WIDTH,
+    shown_handle,
+    square,
+)
 
 MARGIN = 0.75  # cells around what the close view shows
 
@@ -55,9 +65,10 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
         maze: Its name or text.
         window: Which of the answer's windows.
     """
-    state = answer["s"][0]
+    (state,) = (part for part in answer["s"] if isinstance(part, ContinuousDistribution))
     mean = state.most_likely[window].numpy(force=True)  # (K, 4): x, y, goal x, goal y
     weights, means = (part[window].numpy(force=True) for part in (state.weights, state.means))  # (K, n), (K, n, 4)
+    scales = np.zeros_like(means) if state.scales is None else state.scales[window].numpy(force=True)
     scale = None if state.scale is None else state.scale[window].numpy(force=True)
     shown = answer.mask.shown["s"][window].numpy(force=True)  # (K,)
     recorded = None if truth is None else truth.values["s"][window][truth.valid[window]].numpy(force=True)
@@ -73,11 +84,12 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
             *mean[shown, :2].T, s=42, marker="s", facecolors="none", edgecolors=PURPLE, linewidths=1.8, zorder=4
         )
         axes.scatter(*goal, marker="*", s=130, color=GREEN, edgecolors="white", linewidths=0.6, zorder=5)
-        for step, i in np.ndindex(weights.shape) if state.scales is not None else ():
-            wide = state.scales[window, step, i, :2].numpy(force=True)
+        for step, i in np.ndindex(weights.shape):
+            wide = scales[step, i, :2]
             if not np.isnan(wide).any() and wide.any():  # a Gaussian of more weight is darker
-                style = {"color": BLUE, "alpha": 0.16 * weights[step, i] ** 0.5, "linewidth": 0, "zorder": 1}
-                axes.add_patch(Ellipse(means[step, i, :2], *(4 * wide), **style))
+                faint = 0.16 * weights[step, i] ** 0.5
+                x, y = means[step, i, :2]
+                axes.add_patch(Ellipse((x, y), *(4 * wide), color=BLUE, alpha=faint, linewidth=0, zorder=1))
     _zoom(close, mean, scale, recorded)
     whole.set_title("the maze", fontsize=NORMAL)
     close.set_title("closer", fontsize=NORMAL)
@@ -90,14 +102,7 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
     ]
     if scale is not None:
         handles.append(Patch(facecolor=BLUE, alpha=0.25, label="two scales around it"))
-    style: dict[str, Any] = {
-        "marker": "s",
-        "linestyle": "none",
-        "markersize": 6,
-        "markerfacecolor": "none",
-        "color": PURPLE,
-    }
-    handles.append(Line2D([], [], label="shown", **style))
+    handles.append(shown_handle())
     if recorded is not None:
         handles.append(Line2D([], [], color=VERMILLION, linewidth=1.2, label="recorded"))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=SMALL + 1, frameon=False)
@@ -106,10 +111,10 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
 
 def _zoom(axes: Axes, mean: np.ndarray, scale: np.ndarray | None, recorded: np.ndarray | None) -> None:
     """A square view around all that is drawn of the way."""
-    points = [mean[:, :2]] + ([] if recorded is None else [recorded[:, :2]])
+    parts = [mean[:, :2]] + ([] if recorded is None else [recorded[:, :2]])
     if scale is not None:
-        points += [mean[:, :2] - 2 * scale[:, :2], mean[:, :2] + 2 * scale[:, :2]]
-    points = np.concatenate(points)
+        parts += [mean[:, :2] - 2 * scale[:, :2], mean[:, :2] + 2 * scale[:, :2]]
+    points = np.concatenate(parts)
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     middle, half = (low + high) / 2, (high - low).max() / 2 + 0.15 * (high - low).max() + 0.05
     half = max(half, MARGIN / 4)

@@ -5,7 +5,7 @@ opening, and `environment_state` the objects' positions and quaternions and the 
 has no object for, and the repetition of the step before, are left out.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -79,7 +79,7 @@ class MetaWorldEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (gymnasium's)
 
-    def __init__(self, task: str, objects: int | None = None, render_mode: str | None = "rgb_array"):
+    def __init__(self, task: str, objects: int | None = None, render_mode: Literal["rgb_array"] | None = "rgb_array"):
         load_metaworld()
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
