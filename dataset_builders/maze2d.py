@@ -1,15 +1,6 @@
-"""Maze2D's expert, a waypoint controller, and the LeRobotDataset of its episodes (UniMASK, section 5.2).
+"""Maze2D's expert, a waypoint controller, and the LeRobotDataset of its episodes (UniMASK, section 5.2)."""
 
-    python -m dataset_builders.maze2d --episodes 1000
-
-measures building side by side with stepping the environment as often, and prints JSON.
-"""
-
-import argparse
-import json
 import math
-import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +10,7 @@ from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing
 from dataset_builders.videos import CAMERA, camera_feature
-from dataset_builders.writer import dataset_statistics, episode_statistics, write_dataset
+from dataset_builders.writer import write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, _clip
@@ -153,69 +144,3 @@ def _pictures(maze: str, states: np.ndarray) -> Iterator[np.ndarray]:
     parsed = parse_maze(maze)
     for x, y, goal_x, goal_y in states.tolist():
         yield camera_picture(parsed, (int(goal_x), int(goal_y)), (x, y))
-
-
-def measure_build(episodes: int = 1000, rounds: int = 3) -> dict[str, float]:
-    """Time stepping the environment and building a dataset of as many steps, in turns, in one process.
-
-    Stepping is `Maze2DEnv` alone, with actions drawn beforehand and a reset per episode. Building is `build_maze2d` as
-    a user runs it, files included, into a temporary folder. LeRobot's statistics are timed by themselves, over the
-    environment's own columns only, so `build_seconds` less `statistics_seconds` still holds those of the other columns.
-
-    Returns:
-        `steps`; `step_seconds`, `build_seconds` and `statistics_seconds`, each the least over the rounds;
-        `steps_per_second` of stepping; `ratio`, of building less statistics to stepping.
-    """
-    columns, _ = collect_episodes("medium", episodes, seed=0, noise=0.5, progress=False)
-    seconds = np.array(
-        [[stepping_seconds(episodes), building_seconds(episodes), _statistics_seconds(columns)] for _ in range(rounds)]
-    )
-    stepping, building, statistics = seconds.min(axis=0).tolist()
-    steps = episodes * HORIZON
-    return {
-        "steps": steps,
-        "step_seconds": stepping,
-        "build_seconds": building,
-        "statistics_seconds": statistics,
-        "steps_per_second": steps / stepping,
-        "ratio": (building - statistics) / stepping,
-    }
-
-
-def stepping_seconds(episodes: int) -> float:
-    """Of a plain loop of `env.step`, with actions drawn beforehand and a reset for each episode."""
-    env = Maze2DEnv()
-    actions = np.random.default_rng(0).uniform(-1, 1, (episodes, HORIZON, 2)).astype(np.float32)
-    start = time.perf_counter()
-    for seed, episode in enumerate(actions):
-        env.reset(seed=seed)
-        for action in episode:
-            env.step(action)
-    return time.perf_counter() - start
-
-
-def building_seconds(episodes: int) -> float:
-    """Of `build_maze2d`, files included, into a temporary folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        build_maze2d(Path(folder) / "maze2d", episodes=episodes, progress=False)
-        return time.perf_counter() - start
-
-
-def _statistics_seconds(columns: dict[str, np.ndarray]) -> float:
-    lengths = np.full(len(columns["action"]) // HORIZON, HORIZON)
-    start = time.perf_counter()
-    for column in columns.values():
-        dataset_statistics(episode_statistics(column, lengths))
-    return time.perf_counter() - start
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(measure_build.__doc__ or "").splitlines()[0])
-    parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--rounds", type=int, default=3)
-    print(json.dumps(measure_build(**vars(parser.parse_args())), indent=4))
-
-
-if __name__ == "__main__":
-    main()

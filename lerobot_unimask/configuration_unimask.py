@@ -52,8 +52,18 @@ DISCRETE_HEADS = ("joint", "separate")
 CONTINUOUS_HEADS = ("l2", "gaussian", "mixture")
 UNCHANGED = dict.fromkeys(("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY)
 FINE_FROM = 500  # episodes of a task; fewer are learnt by heart from sines and cosines (docs/arm.md)
-# More is a damaged file, or a slip
-MOST = {"mixture_components": 64, "width": 65536, "depth": 512, "heads": 1024, "feedforward_width": 262144}
+# Settings that are numbers from 1 on -> the highest, or the setting that bounds it. More is a damaged file, or a slip.
+MOST: dict[str, int | str] = {
+    "context_length": MAX_CONTEXT,
+    "chunk_size": "context_length",
+    "n_action_steps": "chunk_size",
+    "n_obs_steps": "context_length",
+    "mixture_components": 64,
+    "width": 65536,
+    "depth": 512,
+    "heads": 1024,
+    "feedforward_width": 262144,
+}
 
 
 class FormatVersion(int):
@@ -224,20 +234,12 @@ class UniMASKConfig(PreTrainedConfig):
         if self.use_amp and not has_bfloat16(str(self.device)):
             logger.warning("use_amp does not help here: this processor has no bfloat16 arithmetic. Using float32.")
             self.use_amp = False
-        if not 1 <= self.context_length <= MAX_CONTEXT:
-            raise ValueError(f"context_length is {self.context_length}; it must lie in 1 to {MAX_CONTEXT} steps.")
-        if not 1 <= self.chunk_size <= self.context_length:
-            raise ValueError(
-                f"chunk_size is {self.chunk_size}; it must lie in 1 to context_length, {self.context_length}."
-            )
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
-                f"n_action_steps is {self.n_action_steps}; it must lie in 1 to chunk_size, {self.chunk_size}."
-            )
-        if self.n_obs_steps is not None and not 1 <= self.n_obs_steps <= self.context_length:
-            raise ValueError(
-                f"n_obs_steps is {self.n_obs_steps}; it must lie in 1 to context_length, {self.context_length}."
-            )
+        for name, most in MOST.items():
+            value, bound = getattr(self, name), getattr(self, most) if isinstance(most, str) else most
+            if value is not None and not 1 <= value <= bound:
+                raise ValueError(
+                    f"{name} is {value}; it must lie in 1 to {bound}{f', {most}' if bound != most else ''}."
+                )
         if self.drop_n_last_frames is None:
             self.drop_n_last_frames = self.context_length - 1
         if self.network not in NETWORKS:
@@ -266,9 +268,6 @@ class UniMASKConfig(PreTrainedConfig):
                 f"causal_share is {self.causal_share}; it must lie between 0 and 1. For none or all use "
                 "attention=bidirectional or causal."
             )
-        for name, most in MOST.items():
-            if not 1 <= getattr(self, name) <= most:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in 1 to {most}.")
         if self.width % self.heads:
             raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
         if len(self.image_size) != 2 or not all(1 <= size <= 4096 for size in self.image_size):

@@ -16,7 +16,8 @@ from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import preprocess_observation
 
 import lerobot_unimask.envs  # noqa: F401 (registers the environment)
-from dataset_builders.maze2d import build_maze2d, collect_episodes, measure_build
+from dataset_builders.maze2d import build_maze2d, collect_episodes
+from lerobot_unimask.bench.measuring import building_seconds, stepping_seconds
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv, compile_maze
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, shortest_path
 from lerobot_unimask.envs.maze2d.maze import HORIZON, MAZES, parse_maze
@@ -446,7 +447,7 @@ def test_bad_builds_are_refused_and_leave_nothing(tmp_path, arguments, message):
 
 @pytest.mark.slow
 def test_building_costs_at_most_three_times_stepping():
-    assert measure_build(episodes=1000, rounds=1)["ratio"] <= 3
+    assert building_seconds(1000) <= 3 * stepping_seconds(1000)
 
 
 # --- In LeRobot -------------------------------------------------------------------------------------------------------

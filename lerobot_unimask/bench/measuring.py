@@ -32,7 +32,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.data import default_collate
 
 from dataset_builders.doorkey import build_doorkey
-from dataset_builders.maze2d import HORIZON, build_maze2d, building_seconds, stepping_seconds
+from dataset_builders.maze2d import HORIZON, build_maze2d
 from lerobot_unimask import evaluating as lerobot_evaluation
 from lerobot_unimask.bench.clock import Stopwatch, alone, commit, now, spread
 from lerobot_unimask.configuration_unimask import UniMASKConfig
@@ -369,6 +369,26 @@ def building(what: str, episodes: int, repeats: int) -> dict[str, Any]:
         "episodes": episodes,
         "steps": episodes * HORIZON,
     }
+
+
+def stepping_seconds(episodes: int) -> float:
+    """Of a plain loop of `env.step`, with actions drawn beforehand and a reset for each episode."""
+    env = Maze2DEnv()
+    actions = np.random.default_rng(0).uniform(-1, 1, (episodes, HORIZON, 2)).astype(np.float32)
+    start = time.perf_counter()
+    for seed, episode in enumerate(actions):
+        env.reset(seed=seed)
+        for action in episode:
+            env.step(action)
+    return time.perf_counter() - start
+
+
+def building_seconds(episodes: int) -> float:
+    """Of `build_maze2d`, files included, into a temporary folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        build_maze2d(Path(folder) / "maze2d", episodes=episodes, progress=False)
+        return time.perf_counter() - start
 
 
 def updating(settings: Mapping[str, Any], root: Path, batch_size: int, updates: int) -> dict[str, Any]:

@@ -1,9 +1,4 @@
-"""Maze2D's expert, a waypoint controller, and the LeRobotDataset of its episodes (UniMASK, section 5.2).
-
-    python -m dataset_builders.maze2d --episodes 1000
-
-measures building side by side with stepping the environment as often, and prints JSON.
-"""
+"""Maze2D's expert, a waypoint controller (UniMASK, section 5.2)."""
 
 import math
 from functools import lru_cache
