@@ -6,7 +6,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"  # read when huggingface_hub is imported
 
 import pytest
 import torch
-from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, KINDS, LAYOUTS, Episode
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, KINDS, LAYOUTS, SMALL, Episode
 
 torch.set_num_threads(1)  # two threads beside another busy process are many times slower than one
 
@@ -84,14 +84,49 @@ def tiny_policy(doorkey):
             settings = {"continuous_head": "l2"} | settings
         if kind != "doorkey":
             features, stats = features or CONTINUOUS_FEATURES, stats or CONTINUOUS_STATS
-        small = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "dropout": 0.0}
-        config = UniMASKConfig(device="cpu", **(small | settings))
+        config = UniMASKConfig(device="cpu", **(SMALL | {"dropout": 0.0} | settings))
         config.set_dataset_feature_metadata(features or doorkey.meta.features)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             return UniMASKPolicy(config, dataset_stats=stats or doorkey.meta.stats).eval()
 
     return make
+
+
+@pytest.fixture
+def losses(monkeypatch):
+    """Every training loss of the runs that follow in this process, at full precision."""
+    from lerobot_unimask import UniMASKPolicy
+
+    recorded = []
+    forward = UniMASKPolicy.forward
+
+    def recording(self, batch):
+        loss, parts = forward(self, batch)
+        if self.training:
+            recorded.append(loss.item())
+        return loss, parts
+
+    monkeypatch.setattr(UniMASKPolicy, "forward", recording)
+    return recorded
+
+
+@pytest.fixture
+def refused(capsys):
+    """refused("query", ...) -> what `unimask` says on standard error as it ends with status 2, having said nothing
+    else; any other exception would be a traceback for the user."""
+    from lerobot_unimask import cli
+
+    def run(*arguments):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            cli.main([str(argument) for argument in arguments])
+        assert ended.value.code == 2
+        said = capsys.readouterr()
+        assert not said.out
+        return said.err
+
+    return run
 
 
 @pytest.fixture(params=KINDS)

@@ -2,6 +2,8 @@
 
 import torch
 
+from dataset_builders.doorkey import FEATURES
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.language.training_masks import TrainingMasks
 
 CONTINUOUS_FEATURES = {
@@ -18,7 +20,19 @@ CONTINUOUS_STATS = {
     "timestamp": {"max": [4.9]},
 }
 
-SMALL_FLAGS = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
+SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16}
+SMALL_FLAGS = [f"--policy.{name}={value}" for name, value in SMALL.items()]
+TRAIN_FLAGS = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", *SMALL_FLAGS]
+
+MAZE = {
+    "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
+    "action": {"dtype": "float32", "shape": (2,), "names": None},
+}
+MAZE_STATS = {
+    "observation.state": {"mean": [3.0] * 4, "std": [1.0] * 4},
+    "action": {"mean": [0.0] * 2, "std": [1.0] * 2},
+}
+CORNER = {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]}  # a property of DoorKey's episodes
 PARTS = ("probabilities", "mean", "scale")
 KINDS = ("doorkey", "continuous", "gaussian")
 
@@ -44,6 +58,14 @@ def numbers(answer):
 def assert_same_answers(one, other, exactly=True):
     for a, b in zip(numbers(one), numbers(other), strict=True):
         torch.testing.assert_close(a, b, **({"rtol": 0, "atol": 0} if exactly else {"rtol": 1e-4, "atol": 1e-5}))
+
+
+def doorkey_policy(features=FEATURES, **settings):
+    """An untrained DoorKey policy that scales nothing, as the exact optimum reads its windows."""
+    torch.manual_seed(0)
+    config = UniMASKConfig(device="cpu", **SMALL, **settings)
+    config.set_dataset_feature_metadata(features)
+    return UniMASKPolicy(config)
 
 
 def without_return(doorkey):

@@ -11,10 +11,10 @@ from pathlib import Path
 import commands
 import psutil
 import pytest
+from policies import TRAIN_FLAGS
 from safetensors.torch import load_file
 
-TRAIN = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", "--policy.width=16"]
-TRAIN += ["--policy.depth=1", "--policy.heads=2", "--steps=4", "--batch_size=8", "--log_freq=1", "--num_workers=0"]
+TRAIN = [*TRAIN_FLAGS, "--steps=4", "--batch_size=8", "--log_freq=1", "--num_workers=0"]
 
 
 def as_a_process(script: str, *arguments: str, cwd: Path) -> commands.Result:

@@ -419,24 +419,6 @@ def test_build_makes_a_dataset_that_lerobot_loads(tmp_path, monkeypatch):
     }
 
 
-def test_the_same_seed_builds_the_same_files(tmp_path):
-    def data(name, seed):
-        root = build_doorkey(tmp_path / name, episodes=5, seed=seed)
-        return {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-    first, again, other = data("first", 0), data("again", 0), data("other", 1)
-    assert first == again
-    assert first != other
-
-
-def test_a_full_folder_is_refused_before_any_work(tmp_path, monkeypatch):
-    (tmp_path / "precious").write_text("data")
-    monkeypatch.setattr("dataset_builders.doorkey.rollout", None)
-    with pytest.raises(FileExistsError, match="not empty"):
-        build_doorkey(tmp_path, episodes=5)
-    assert [path.name for path in tmp_path.iterdir()] == ["precious"]
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

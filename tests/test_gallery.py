@@ -4,20 +4,11 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 from PIL import Image
+from policies import CORNER, MAZE, MAZE_STATS
 
 from lerobot_unimask import cli
 from lerobot_unimask.paper import gallery
 from lerobot_unimask.paper.gallery import LARGEST, Picture, doorkey_pictures, maze_pictures, write_gallery
-
-MAZE = {
-    "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
-    "action": {"dtype": "float32", "shape": (2,), "names": None},
-}
-MAZE_STATS = {
-    "observation.state": {"mean": [3.0] * 4, "std": [1.0] * 4},
-    "action": {"mean": [0.0] * 2, "std": [1.0] * 2},
-}
-CORNER = {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]}
 
 
 def test_the_page_names_every_picture(tmp_path):

@@ -6,9 +6,8 @@ import json
 import numpy as np
 import pytest
 import torch
+from policies import doorkey_policy
 
-from dataset_builders.doorkey import FEATURES
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.envs.doorkey.episodes import rollout as expert_rollout
 from lerobot_unimask.envs.doorkey.optimum import Optimum
 from lerobot_unimask.envs.doorkey.panels import (
@@ -30,17 +29,9 @@ from lerobot_unimask.envs.doorkey.rules import GOAL, HORIZON, START_PAIRS, rewar
 IMITATION, _ = ROLLOUTS["Imitation"]
 
 
-def make_policy(**settings):
-    """A tiny policy that has learned nothing."""
-    torch.manual_seed(0)
-    config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16, **settings)
-    config.set_dataset_feature_metadata(FEATURES)
-    return UniMASKPolicy(config)
-
-
 @pytest.fixture(scope="module")
 def policy():
-    return make_policy()
+    return doorkey_policy()
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +117,7 @@ def test_given_states_are_found_by_step():
 
 
 def test_histories_drawn_backwards_are_possible_and_end_in_the_given_state(monkeypatch):
-    policy = make_policy()
+    policy = doorkey_policy()
     monkeypatch.setattr(policy, "predict", Optimum().predict)  # what a policy that has learnt everything would answer
     panel = backwards_panel(policy, histories=20)
     states, actions = np.array(panel.states), np.array(panel.actions)
@@ -167,4 +158,4 @@ def test_predicted_states_of_other_states(policy):
 
 def test_a_window_that_is_not_an_episode_is_refused():
     with pytest.raises(ValueError, match=r"10 steps.*context_length is 5"):
-        five_panels(make_policy(context_length=5))
+        five_panels(doorkey_policy(context_length=5))

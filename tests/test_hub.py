@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from hub_server import Hub
+from policies import SMALL_FLAGS
 
 from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.configuration_unimask import FORMAT_VERSION
@@ -48,14 +49,13 @@ def test_the_console_scripts_with_a_hub_and_then_without(tmp_path: Path) -> None
         assert done.returncode == status, done.stderr[-3000:]
         return done.stderr if status else done.stdout
 
-    small = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
     train = ["--policy.device=cpu", "--num_workers=0", "--batch_size=8", "--steps=2", "--dataset.repo_id=me/data"]
     query = ["query", "--policy.path=me/policy", "--dataset.repo_id=me/data", "--episode=0", "--mask=past", "--t=3"]
     evaluate = ["--policy.path=me/policy", "--env.type=doorkey", "--eval.n_episodes=1", "--eval.batch_size=1"]
     with Hub({"token": "me"}) as hub:
         environment |= {"HF_ENDPOINT": hub.endpoint, "HF_TOKEN": "token"}
         run("unimask", "build", "doorkey", "--episodes=20", "--root=data", "--repo_id=me/data", "--push_to_hub=true")
-        flags = ["--policy.type=unimask", "--policy.repo_id=me/policy", *small, *train, "--output_dir=run"]
+        flags = ["--policy.type=unimask", "--policy.repo_id=me/policy", *SMALL_FLAGS, *train, "--output_dir=run"]
         run("lerobot-train", *flags)
         assert "lerobot-train --policy.type=unimask" in hub.model("me/policy").files["README.md"].decode()
         answer = run("unimask", *query, "--json")

@@ -9,22 +9,15 @@ from pathlib import Path
 import commands
 import pytest
 import torch
+from policies import TRAIN_FLAGS
 
-from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.data.episodes import open_dataset
 
-SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
-TRAIN = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", *SMALL]
-
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_doorkey(tmp_path_factory.mktemp("data") / "doorkey", episodes=40, progress=False)
-
-
-def dataset(root: Path) -> list[str]:
-    return ["--dataset.repo_id=local/doorkey", f"--dataset.root={root}"]
+def data(doorkey_root: Path) -> list[str]:
+    return ["--dataset.repo_id=local/doorkey", f"--dataset.root={doorkey_root}"]
 
 
 def in_process(script: str, *arguments: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,13 +29,13 @@ def in_process(script: str, *arguments: str, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.fixture(scope="module")
-def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def trained(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A run of the real command with LeRobot's own defaults for workers and asynchronous environments."""
     folder = tmp_path_factory.mktemp("train")
     flags = ["--steps=4", "--batch_size=8", "--dataset.eval_split=0.25", "--eval_steps=2", "--save_freq=2"]
     flags += ["--log_freq=1", "--env.type=doorkey", "--env_eval_freq=4", "--eval.n_episodes=3", "--eval.batch_size=3"]
     log = commands.check(
-        "lerobot-train", *TRAIN, *dataset(root), *flags, "--num_workers=1", "--output_dir=run", cwd=folder
+        "lerobot-train", *TRAIN_FLAGS, *data, *flags, "--num_workers=1", "--output_dir=run", cwd=folder
     )
     return folder / "run", log
 
@@ -58,15 +51,22 @@ def test_lerobot_train_trains_validates_evaluates_and_saves(trained: tuple[Path,
     assert policy.config.features["s"][0].categories == [16, 16]
 
 
-def test_workers_change_no_loss(root: Path, tmp_path: Path) -> None:
+def test_workers_change_no_loss(data: list[str], tmp_path: Path) -> None:
     """Windows are read in batches, so none are started: they would see another order from the second epoch on."""
-    flags = [*TRAIN, *dataset(root), "--steps=12", "--batch_size=8", "--log_freq=1", "--save_checkpoint=false"]
+    flags = [
+        *TRAIN_FLAGS,
+        *data,
+        "--steps=12",
+        "--batch_size=8",
+        "--log_freq=1",
+        "--save_checkpoint=false",
+    ]
     logs = [
         commands.check("lerobot-train", *flags, f"--num_workers={n}", f"--output_dir=run{n}", cwd=tmp_path)
         for n in (0, 2)
     ]
     without, beside = (re.findall(r" loss:(\S+) grdn:(\S+)", log) for log in logs)
-    assert len(without) == 12  # an epoch has five
+    assert len(without) == 12  # an epoch has four
     assert beside == without
     assert "num_workers=0" in logs[1]
 
@@ -94,28 +94,19 @@ def test_lerobot_eval_with_other_questions(trained: tuple[Path, str], tmp_path: 
     assert all(-10 <= value <= 10 and value == round(value) for value in returns)
 
 
-@pytest.fixture
-def losses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Every training loss of the runs that follow, at full precision."""
-    recorded: list[float] = []
-    forward = UniMASKPolicy.forward
-
-    def recording(self, batch):
-        loss, parts = forward(self, batch)
-        if self.training:
-            recorded.append(loss.item())
-        return loss, parts
-
-    monkeypatch.setattr(UniMASKPolicy, "forward", recording)
-    return recorded
-
-
 def test_a_resumed_run_has_the_losses_of_one_that_was_not_interrupted(
-    root: Path, tmp_path: Path, losses: list[float], monkeypatch: pytest.MonkeyPatch
+    data: list[str], tmp_path: Path, losses: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flags = [*TRAIN, *dataset(root), "--policy.dropout=0", "--batch_size=4", "--num_workers=0", "--save_freq=4"]
+    flags = [
+        *TRAIN_FLAGS,
+        *data,
+        "--policy.dropout=0",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--save_freq=4",
+    ]
     run = tmp_path / "run"
-    # 40 windows are ten batches: eight updates stay within the first epoch, as far as LeRobot restores the order.
+    # 30 windows are eight batches: eight updates stay within the first epoch, as far as LeRobot restores the order.
     in_process("lerobot-train", *flags, "--steps=8", f"--output_dir={run}", monkeypatch=monkeypatch)
     whole = losses.copy()
     losses.clear()
@@ -128,11 +119,17 @@ def test_a_resumed_run_has_the_losses_of_one_that_was_not_interrupted(
 
 
 def test_fine_tuning_goes_on_from_the_weights_with_other_masks(
-    trained: tuple[Path, str], root: Path, tmp_path: Path, losses: list[float], monkeypatch: pytest.MonkeyPatch
+    trained: tuple[Path, str], data: list[str], tmp_path: Path, losses: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint = trained[0] / "checkpoints/last/pretrained_model"
     flags = [f"--policy.path={checkpoint}", "--policy.push_to_hub=false", "--policy.training_masks=past"]
-    flags += [*dataset(root), "--steps=2", "--batch_size=8", "--num_workers=0", f"--output_dir={tmp_path / 'run'}"]
+    flags += [
+        *data,
+        "--steps=2",
+        "--batch_size=8",
+        "--num_workers=0",
+        f"--output_dir={tmp_path / 'run'}",
+    ]
     in_process("lerobot-train", *flags, monkeypatch=monkeypatch)
     tuned = UniMASKPolicy.from_pretrained(tmp_path / "run/checkpoints/last/pretrained_model")
     assert tuned.config.training_masks == "past"
@@ -144,34 +141,40 @@ def test_fine_tuning_goes_on_from_the_weights_with_other_masks(
 
 
 def test_bad_settings_end_before_anything_is_written(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    data: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.ERROR)
     run = tmp_path / "run"
-    flags = [*TRAIN, *dataset(root), "--steps=2", "--num_workers=0", f"--output_dir={run}"]
+    flags = [*TRAIN_FLAGS, *data, "--steps=2", "--num_workers=0", f"--output_dir={run}"]
     with pytest.raises(ValueError, match="no factor 'q'"):
         in_process("lerobot-train", *flags, "--policy.training_masks=a[t] | q[0]", monkeypatch=monkeypatch)
     assert not run.exists()
 
 
 def test_streams_are_refused_with_what_to_use_instead(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flags = [*TRAIN, *dataset(root), "--steps=2", f"--output_dir={tmp_path / 'run'}", "--dataset.streaming=true"]
+    flags = [
+        *TRAIN_FLAGS,
+        *data,
+        "--steps=2",
+        f"--output_dir={tmp_path / 'run'}",
+        "--dataset.streaming=true",
+    ]
     with pytest.raises(ValueError, match="Leave out --dataset\\.streaming"):
         in_process("lerobot-train", *flags, monkeypatch=monkeypatch)
 
 
-def test_global_generators_do_not_matter_to_validation(trained: tuple[Path, str], root: Path) -> None:
+def test_global_generators_do_not_matter_to_validation(trained: tuple[Path, str], doorkey_root: Path) -> None:
     """The validation loss of a checkpoint is one number, however often and in whatever order it is computed."""
     from lerobot_unimask.data.episodes import first_windows
     from lerobot_unimask.validation import task_losses
 
     policy = UniMASKPolicy.from_pretrained(trained[0] / "checkpoints/last/pretrained_model")
-    batch = first_windows(open_dataset(policy.config, root))
+    batch = first_windows(open_dataset(policy.config, doorkey_root))
     torch.manual_seed(1)
     once = task_losses(policy, batch, ["behavior_cloning", "random_mask"])
     torch.manual_seed(2)
     again = task_losses(policy, batch, ["random_mask", "behavior_cloning"])
     assert once == again
-    assert batch["observation.state"].shape == (40, 10, 2)
+    assert batch["observation.state"].shape == (30, 10, 2)

@@ -8,9 +8,8 @@ import torch
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from policies import MAZE, MAZE_STATS, doorkey_policy
 
-from dataset_builders.doorkey import FEATURES
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.envs.doorkey import panels as gridworld
 from lerobot_unimask.envs.doorkey.episodes import rollout
@@ -31,10 +30,7 @@ from lerobot_unimask.plots.style import ASKED, LEAST, SHOWN, WALL, WIDTH, time_c
 
 @pytest.fixture(scope="module")
 def policy():
-    torch.manual_seed(0)
-    config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16)
-    config.set_dataset_feature_metadata(FEATURES)
-    return UniMASKPolicy(config)
+    return doorkey_policy()
 
 
 def legend_of(figure):
@@ -246,16 +242,6 @@ def test_distributions_are_shares_of_each_group(policy, tiny_policy, continuous_
     nothing = Window({name: values * torch.nan for name, values in window.values.items()}, window.valid)
     with pytest.raises(ValueError, match="nothing to draw"):
         distributions({"all": window, "none": nothing}, continuous.factors)
-
-
-MAZE = {
-    "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
-    "action": {"dtype": "float32", "shape": (2,), "names": None},
-}
-MAZE_STATS = {
-    "observation.state": {"mean": [3.0] * 4, "std": [1.0] * 4},
-    "action": {"mean": [0.0] * 2, "std": [1.0] * 2},
-}
 
 
 @pytest.mark.parametrize("kind", ["continuous", "gaussian"])

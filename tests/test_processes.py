@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from policies import TRAIN_FLAGS
 from torch import distributed
 
 from dataset_builders.doorkey import build_doorkey
 
 UPDATES = 100
 WITHOUT_DROPOUT = ["--policy.dropout=0", "--policy.optimizer_grad_clip_norm=1e9"]  # gradients as they are, not scaled
-SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
 
 
 class Group:
@@ -80,7 +80,7 @@ def recorded_run(launcher: list[str], arguments: list[str], output: Path) -> dic
 def test_accelerate_launch_trains_the_model_of_one_process_with_twice_the_batch(tmp_path: Path) -> None:
     # 1,000 windows, of which a hundred updates take 800: within the first epoch no batch is short.
     root = build_doorkey(tmp_path / "doorkey", episodes=1000, progress=False)
-    train = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", *SMALL, *WITHOUT_DROPOUT]
+    train = [*TRAIN_FLAGS, *WITHOUT_DROPOUT]
     train += ["--dataset.repo_id=local/doorkey", f"--dataset.root={root}", f"--steps={UPDATES}", "--log_freq=1"]
     train += ["--num_workers=0", "--save_checkpoint=false", "--dataset.eval_split=0.1", "--eval_steps=100"]
     # With --cpu accelerate leaves it to MPI to start processes and, without that, starts one; --multi_gpu starts them

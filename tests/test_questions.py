@@ -5,28 +5,20 @@ import json
 import numpy as np
 import pytest
 import torch
+from policies import CORNER, doorkey_policy
 
 from dataset_builders.doorkey import FEATURES
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy, cli
+from lerobot_unimask import cli
 from lerobot_unimask.envs.doorkey.episodes import rollout
 from lerobot_unimask.envs.doorkey.optimum import Optimum
 from lerobot_unimask.envs.doorkey.rules import HORIZON, START_PAIRS
 from lerobot_unimask.paper import questions
 
-CORNER = {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]}
-
-
-def make_policy(features=FEATURES, **settings):
-    torch.manual_seed(0)
-    config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16, **settings)
-    config.set_dataset_feature_metadata(features)
-    return UniMASKPolicy(config)
-
 
 @pytest.fixture(scope="module")
 def exact():
     """A policy that answers with the exact posterior."""
-    policy = make_policy()
+    policy = doorkey_policy()
     optimum = Optimum("paper")
 
     def predict(window, mask, cache=None):
@@ -114,7 +106,7 @@ def test_orders_agree_where_the_network_is_exact(exact):
 def test_every_measurement_is_in_the_record(doorkey_root, tmp_path, monkeypatch, capsys):
     """Of a model that has learnt nothing; its samples would not pass a real check."""
     features = {**FEATURES, f"observation.{questions.PROPERTY}": CORNER}
-    policy = make_policy(features, properties=[f"observation.{questions.PROPERTY}"])
+    policy = doorkey_policy(features, properties=[f"observation.{questions.PROPERTY}"])
     policy.save_pretrained(tmp_path / "policy")
     monkeypatch.setattr(
         questions, "DynamicsCheck", lambda **_: lambda values, decided: torch.ones(len(values["s"]), dtype=torch.bool)
@@ -140,4 +132,4 @@ def test_other_policies_are_refused(tiny_policy, continuous_batch):
     with pytest.raises(ValueError, match="whole DoorKey episodes"):
         questions.ask_everything(tiny_policy("continuous"), continuous_batch)
     with pytest.raises(ValueError, match="context_length is 5"):
-        questions.ask_everything(make_policy(context_length=5), continuous_batch)
+        questions.ask_everything(doorkey_policy(context_length=5), continuous_batch)

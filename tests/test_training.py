@@ -4,26 +4,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from policies import SMALL
 
-from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.training import Trainer
 
-SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "device": "cpu"}
-
-
-@pytest.fixture
-def losses(monkeypatch) -> list[float]:
-    """Every training loss of the runs that follow, at full precision."""
-    recorded: list[float] = []
-    forward = UniMASKPolicy.forward
-
-    def recording(self, batch):
-        loss, parts = forward(self, batch)
-        recorded.append(loss.item())
-        return loss, parts
-
-    monkeypatch.setattr(UniMASKPolicy, "forward", recording)
-    return recorded
+SETTINGS = SMALL | {"device": "cpu"}
 
 
 def lerobot_train(monkeypatch, root: Path, *flags: str) -> None:
@@ -36,7 +21,7 @@ def lerobot_train(monkeypatch, root: Path, *flags: str) -> None:
 
 def test_its_losses_are_those_of_lerobot_train(doorkey_root, tmp_path, losses, monkeypatch):
     """Four epochs of 30 windows in batches of 8, with dropout; then fine-tuning from the checkpoint that it left."""
-    settings = SMALL | {"dropout": 0.3, "training_masks": "multi_task"}
+    settings = SETTINGS | {"dropout": 0.3, "training_masks": "multi_task"}
     flags = [f"--policy.{name}={value}" for name, value in settings.items()]
     monkeypatch.chdir(tmp_path)
     training = ("--seed=7", "--steps=16", "--batch_size=8", "--save_freq=16")
@@ -58,6 +43,6 @@ def test_its_losses_are_those_of_lerobot_train(doorkey_root, tmp_path, losses, m
 
 def test_what_is_not_there_is_named(doorkey_root, tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
-        Trainer(SMALL, tmp_path, seed=0, steps=1, batch_size=8)
+        Trainer(SETTINGS, tmp_path, seed=0, steps=1, batch_size=8)
     with pytest.raises(ValueError, match="flavour"):
-        Trainer(SMALL | {"flavour": 1}, doorkey_root, seed=0, steps=1, batch_size=8)
+        Trainer(SETTINGS | {"flavour": 1}, doorkey_root, seed=0, steps=1, batch_size=8)
