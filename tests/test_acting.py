@@ -27,8 +27,8 @@ def test_acting_is_a_question_asked_at_every_step(kind, layout, question, K, tin
     episode = Episode(kind, B, T)
     for step in range(T):
         torch.manual_seed(step)
-        sampled = kind != "continuous"  # so that the whole distribution has a say in what happens
-        action = policy.select_action(episode.observation(step), sample=sampled)
+        sampled = step % 2 == 0  # by turns a draw, in which the whole distribution has a say, and what is most likely
+        action = policy.select_action(episode.observation(step), **({"sample": True} if sampled else {}))
 
         batch, first, position = episode.window(step, K, policy.statistics.fps.item())
         values = {}
@@ -45,38 +45,19 @@ def test_acting_is_a_question_asked_at_every_step(kind, layout, question, K, tin
         episode.actions.append(action)
 
 
-def test_the_most_likely_action_is_the_default(tiny_policy):
-    policy = tiny_policy()
-    state = torch.tensor([[1.0, 2.0], [7.0, 3.0]])
-    action = policy.select_action({"observation.state": state})
-    batch = {
-        "observation.state": torch.zeros(2, 10, 2),
-        "action": torch.zeros(2, 10),
-        "observation.return_to_go": torch.zeros(2, 10),
-    }
-    batch["observation.state"][:, 0] = state
-    probabilities = policy.infer(batch, "behavior_cloning", t=0)["a"][0].probabilities[:, 0]
-    assert action[:, 0].tolist() == probabilities.argmax(-1).tolist()
-
-
-def test_actions_can_be_sampled(tiny_policy):
-    state = {"observation.state": torch.tensor([[1.0, 2.0]]).expand(4000, 2)}
-    policy = tiny_policy()
-    best = policy.select_action(state)
-    assert (best == best[0]).all()
-    policy.reset()
-    torch.manual_seed(0)
-    drawn = policy.select_action(state, sample=True)[:, 0]
-    policy.reset()
-    answer = policy.infer(None, "behavior_cloning", t=0, given={"s[0]": [1, 2]})
-    expected = 4000 * answer["a"][0].probabilities[0, 0]
-    counts = drawn.bincount(minlength=4).float()
-    assert ((counts - expected).square() / expected).sum() < 35  # three degrees of freedom
-    by_config = tiny_policy(sample_actions=True)
-    torch.manual_seed(0)
-    assert torch.equal(by_config.select_action(state)[:, 0], drawn)
-    by_config.reset()
-    assert torch.equal(by_config.select_action(state, sample=False), best)
+def test_whether_actions_are_drawn_is_a_setting_too(tiny_policy):
+    state = {"observation.state": torch.tensor([[1.0, 2.0]]).expand(50, 2)}
+    by_argument, by_setting = tiny_policy(), tiny_policy(sample_actions=True)
+    best = by_argument.select_action(state)
+    drawn = []
+    for policy, how in ((by_argument, {"sample": True}), (by_setting, {})):
+        policy.reset()
+        torch.manual_seed(0)
+        drawn.append(policy.select_action(state, **how))
+    assert torch.equal(*drawn)
+    assert len(drawn[0].unique()) > 1
+    by_setting.reset()
+    assert torch.equal(by_setting.select_action(state, sample=False), best)
 
 
 def test_resetting_forgets_the_episode(tiny_policy, states):
@@ -188,20 +169,10 @@ def test_settings_and_arguments_say_the_same(tiny_policy, states):
     assert torch.equal(roll(by_target, states), by_argument)
 
 
-def test_the_target_shrinks_by_what_was_received_before_the_window(tiny_policy):
+def test_a_return_over_several_windows_needs_what_was_paid_so_far(tiny_policy, states):
     policy = tiny_policy("continuous", context_length=3, inference_mask="reward_conditioned", target_return=40.0)
-    episode = Episode("continuous", 4, 7)
-    for step in range(7):
-        action = policy.select_action(episode.observation(step))
-        window = policy._memory.window(policy.statistics.horizon)
-        assert policy._memory.first_step == max(0, step - 2)
-        torch.testing.assert_close(
-            window.values["rtg"][:, 0, 1], torch.full((4,), max(0, step - 2) / policy.statistics.horizon.item())
-        )
-        assert action.isfinite().all()
-    policy.reset()
     with pytest.raises(ValueError, match=r"observation\.return_so_far"):  # said at the first step already
-        policy.select_action({"observation.state": episode.states[0]})
+        policy.select_action({"observation.state": states[0]})
 
 
 def test_given_and_target_return_cannot_both_name_the_return(tiny_policy):

@@ -7,6 +7,7 @@ import pytest
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from lerobot_unimask import MaskError, UniMASKConfig
+from lerobot_unimask.configuration_unimask import MOST
 from lerobot_unimask.data.factors import Feature
 
 
@@ -21,21 +22,20 @@ def parse(*arguments):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"context_length": 0}, "context_length is 0"),
-        ({"context_length": 5000}, "context_length is 5000"),
         ({"token_layout": "heap"}, "token_layout is 'heap'; choose one of stacked, separate"),
         ({"attention": "sideways"}, "attention is 'sideways'; choose one of both, bidirectional, causal"),
         ({"causal_share": 1.0}, "causal_share is 1.0; it must lie between 0 and 1"),
         ({"token_layout": "stacked"}, "token_layout=stacked needs attention=bidirectional"),
         ({"continuous_head": "median"}, "continuous_head is 'median'; choose one of l2, gaussian, mixture"),
-        ({"mixture_components": 65}, "mixture_components is 65; it must lie in 1 to 64"),
-        ({"width": 0}, "width is 0"),
-        ({"depth": -1}, "depth is -1"),
-        ({"heads": 0}, "heads is 0"),
-        ({"feedforward_width": 0}, "feedforward_width is 0"),
+        *(({name: 0}, f"{name} is 0; it must lie in 1 to") for name in MOST),
+        *(({name: 10**9}, f"{name} is 1000000000; it must lie in 1 to") for name in MOST),
+        ({"chunk_size": 11}, "chunk_size is 11; it must lie in 1 to 10, context_length"),
+        ({"chunk_size": 4, "n_action_steps": 5}, "n_action_steps is 5; it must lie in 1 to 4, chunk_size"),
+        ({"n_obs_steps": 11}, "n_obs_steps is 11; it must lie in 1 to 10, context_length"),
         ({"width": 10, "heads": 4}, r"width \(10\) must be a multiple of heads \(4\)"),
         ({"dropout": 1.0}, "dropout is 1.0"),
         ({"dropout": -0.1}, "dropout is -0.1"),
+        ({"loss_weights": {"rtg": 1.0}}, "loss_weights names rtg"),
         ({"training_masks": []}, "training_masks is empty"),
         ({"training_masks": {"past": -1.0}}, "weights are positive"),
     ],
@@ -116,6 +116,10 @@ def test_states_and_actions_are_needed(key):
     entries = {name: entry for name, entry in ENTRIES.items() if name not in (key, "observation.environment_state")}
     with pytest.raises(ValueError, match=f"no '{key}'"):
         make().set_dataset_feature_metadata(entries)
+    declared = {"observation.state": FeatureType.STATE, "action": FeatureType.ACTION}
+    features = {name: PolicyFeature(kind, (2,)) for name, kind in declared.items() if name != key}
+    with pytest.raises(ValueError, match=f"no '{key}'"):
+        make(input_features=features).validate_features()
 
 
 def test_declared_features_serve_where_no_dataset_was_read():

@@ -13,8 +13,8 @@ from policies import CONTINUOUS_STATS, assert_same_answers, assert_unchanged, wi
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from lerobot_unimask import MaskError, UniMASKConfig, UniMASKPolicy
-from lerobot_unimask.language.training_masks import TrainingMasks, mixture
+from lerobot_unimask import MaskError, UniMASKPolicy
+from lerobot_unimask.language.training_masks import TrainingMasks
 
 
 def test_policy_and_config_are_found_by_name():
@@ -258,17 +258,6 @@ def test_training_lowers_the_loss(tiny_policy, doorkey_batch):
     assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
 
 
-def test_a_dataset_without_actions_or_states_is_refused(doorkey, tiny_policy):
-    for key in ("action", "observation.state"):
-        features = {name: entry for name, entry in doorkey.meta.features.items() if name != key}
-        with pytest.raises(ValueError, match=f"no '{key}'"):
-            tiny_policy(features=features)
-        config = UniMASKConfig(device="cpu")
-        config.input_features, config.output_features = declared_features(features)
-        with pytest.raises(ValueError, match=f"no '{key}'"):
-            UniMASKPolicy(config)
-
-
 def test_without_a_return_column_there_is_no_return_factor(doorkey, tiny_policy, doorkey_batch):
     policy = tiny_policy(features=without_return(doorkey))
     assert list(policy.factors) == ["s", "a"]
@@ -292,11 +281,6 @@ def test_acting_needs_a_question_about_the_action_now(tiny_policy, mask):
         policy.select_action({"observation.state": torch.zeros(1, 2)}, mask=mask)
 
 
-def test_only_states_and_actions_have_a_loss(tiny_policy):
-    with pytest.raises(ValueError, match=r"loss_weights names rtg"):
-        tiny_policy(loss_weights={"rtg": 1.0})
-
-
 @pytest.mark.parametrize(
     "observation", [{}, {"observation.state": torch.zeros(3, 4)}, {"observation.state": torch.zeros(2)}]
 )
@@ -316,12 +300,3 @@ def test_statistics_arrive_on_the_models_device(tiny_policy):
 def test_categories_that_the_data_exceed_are_refused(tiny_policy):
     with pytest.raises(ValueError, match=r"observation\.state reaches \[16\.0, 3\.0\]"):
         tiny_policy().statistics.fill({"observation.state": {"max": [16, 3]}})
-
-
-def test_multi_task_goes_without_the_return_where_there_is_none():
-    assert len(mixture("multi_task", ("s", "a", "rtg"))) == 8
-    weights = mixture("multi_task", ("s", "a"))
-    assert "reward_conditioned" not in weights
-    assert sum(weights.values()) == pytest.approx(1)
-    with pytest.raises(MaskError, match="no factor 'rtg'"):
-        TrainingMasks("reward_conditioned", ("s", "a"), 4)

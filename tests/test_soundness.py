@@ -147,14 +147,6 @@ def test_a_loss_that_is_not_finite_ends_the_training_and_is_not_saved(tiny_polic
     assert not (tmp_path / "checkpoint" / "model.safetensors").exists()
 
 
-def test_a_column_of_numpy_numbers_is_a_column(tiny_policy, doorkey_batch):
-    arrays = {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in doorkey_batch.items()}
-    policy = tiny_policy()
-    one, other = policy.make_window(arrays), policy.make_window(doorkey_batch)
-    assert torch.equal(one.valid, other.valid)
-    assert all(torch.equal(one.values[name], value) for name, value in other.values.items())
-
-
 def test_fine_tuning_says_how_far_another_dataset_lies(tiny_policy, root, tmp_path, caplog):
     from lerobot_unimask import UniMASKPolicy
 

@@ -179,6 +179,12 @@ def test_weights_are_respected():
     assert_frequencies([*observed, B - sum(observed)], list(weights.values()))
 
 
+def test_multi_task_goes_without_the_return_where_there_is_none():
+    weights = mixture("multi_task", ("s", "a"))
+    assert "reward_conditioned" not in weights
+    assert sum(weights.values()) == pytest.approx(1)
+
+
 def test_a_regime_shares_its_weight():
     assert mixture("multi_task") == pytest.approx(dict.fromkeys(TASKS, 1 / 8))
     assert mixture(["multi_task", "past"])["past"] == pytest.approx(1 + 1 / 8)
