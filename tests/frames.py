@@ -6,12 +6,9 @@ One camera of 96 x 96, K = 10, 20 episodes of 150 steps of video, made by LeRobo
 """
 
 import json
-import os
-import platform
 import sys
 import tempfile
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +16,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import default_collate
 
 from lerobot_unimask.data import frames, reads
+from lerobot_unimask.machine import describe_machine
+from lerobot_unimask.records import versions, write_json
 
 KEY, SIDE, K, EPISODES, STEPS, BATCH, SEED = "observation.images.top", 96, 10, 20, 150, 64, 0
 
@@ -74,10 +73,10 @@ def main(output: Path, folder: Path) -> None:
         "cache_bytes": sum(size for _, size in frames.stored_files(folder / "cache")),
         "video_bytes": sum(path.stat().st_size for path in (folder / "dataset").rglob("*.mp4")),
         "backend": dataset._video_backend,
-        "versions": {name: version(name) for name in ("lerobot", "torch", "torchcodec", "av")},
-        "machine": {"cores": os.cpu_count(), "processor": platform.machine(), "load": os.getloadavg()[0]},
+        "versions": versions("torchcodec", "av"),
+        "machine": describe_machine(),
     }
-    output.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(output, result)
     print(json.dumps(result, indent=2))
 
 

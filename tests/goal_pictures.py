@@ -7,12 +7,9 @@ is the pictured state: agent and key in the same cells at that step.
 """
 
 import json
-import os
-import platform
 import sys
 import tempfile
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -21,6 +18,8 @@ import lerobot_policy_unimask  # noqa: F401
 from dataset_builders.doorkey import build_doorkey
 from lerobot_unimask.data.episodes import first_windows, open_dataset
 from lerobot_unimask.envs.doorkey.environment import DoorKeyEnv
+from lerobot_unimask.machine import describe_machine
+from lerobot_unimask.records import versions, write_json
 from lerobot_unimask.training import Trainer
 
 KEY, K = "observation.images.top", 10
@@ -73,10 +72,10 @@ def main(output: Path, folder: Path) -> None:
         "reached": shares,
         "loss": {"first 100": sum(losses[:100]) / 100, "last 100": sum(losses[-100:]) / 100},
         "seconds": {"building and training": round(trained), "all": round(time.perf_counter() - began)},
-        "versions": {name: version(name) for name in ("lerobot", "torch")},
-        "machine": {"cores": os.cpu_count(), "processor": platform.machine(), "load": os.getloadavg()[0]},
+        "versions": versions(),
+        "machine": describe_machine(),
     }
-    output.write_text(json.dumps(record, indent=2) + "\n")
+    write_json(output, record)
     print(json.dumps(shares, indent=2))
 
 

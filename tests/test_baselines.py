@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from policies import without_return
 from torch.utils.data import default_collate
 
 from lerobot_unimask.configuration_unimask import NETWORKS, UniMASKConfig
@@ -226,9 +227,8 @@ def test_a_later_return_that_nobody_knows_is_asked_for(policy):
 
 
 def test_a_decision_transformer_needs_returns(doorkey, policy):
-    features = {key: value for key, value in doorkey.meta.features.items() if key != "observation.return_to_go"}
     with pytest.raises(ValueError, match="reads a return at every step"):
-        policy("decision_transformer", features=features, training_masks="behavior_cloning")
+        policy("decision_transformer", features=without_return(doorkey), training_masks="behavior_cloning")
 
 
 def test_the_returns_that_are_read_matter(policy, doorkey_batch):

@@ -135,19 +135,6 @@ def test_the_config_files_are_read(name):
     assert set(read_config(HeatmapConfig, CONFIGS / f"{name}.yaml").rows) <= {*ROWS, FINETUNE}
 
 
-def test_bad_settings_are_named(tmp_path, capsys):
-    for text, message in (
-        ("rows: [mlp]", "has no row 'mlp'"),
-        ("rows: [finetune]", "goes on from random_mask"),
-        ("seedz: [0]", "seedz"),
-        ("steps: many", "steps"),
-    ):
-        (tmp_path / "bad.yaml").write_text(text)
-        with pytest.raises(SystemExit):
-            cli.main(["paper", "heatmap", f"--config_path={tmp_path / 'bad.yaml'}"])
-        assert message in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_the_two_minute_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from policies import CONTINUOUS_STATS
+from policies import CONTINUOUS_STATS, TRAIN_FLAGS
 from torch import nn
 
 from lerobot_unimask.envs.configs import GymnasiumEnvConfig
@@ -43,13 +43,9 @@ def test_another_reduction_is_refused(tiny_policy, doorkey_batch):
 
 
 def test_lerobot_train_weights_samples(doorkey_root, tmp_path):
-    small = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
     log = commands.check(
         "lerobot-train",
-        "--policy.type=unimask",
-        "--policy.push_to_hub=false",
-        "--policy.device=cpu",
-        *small,
+        *TRAIN_FLAGS,
         "--dataset.repo_id=local/doorkey",
         f"--dataset.root={doorkey_root}",
         "--sample_weighting.type=uniform",

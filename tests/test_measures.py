@@ -190,20 +190,3 @@ output: {tmp_path / "out"}
     assert hidden["zeros"].abs().max() == 0
     assert (tmp_path / "out" / "short.png").stat().st_size > 10_000
     assert "| plain, K = 6 |" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("seeds: []", "seeds is empty"),
-        ("variants: {a/b: {}}", "leave '/' out"),
-        ("steps: 0", "at least 1"),
-        ("zero_hidden: zeros", "the variants are default"),
-        ("rolouts: 3", "rolouts"),
-    ],
-)
-def test_a_wrong_configuration_is_refused(tmp_path, capsys, line, message):
-    (tmp_path / "wrong.yaml").write_text(line + "\n")
-    with pytest.raises(SystemExit):
-        main(["paper", "ablation", f"--config_path={tmp_path / 'wrong.yaml'}"])
-    assert message in capsys.readouterr().err

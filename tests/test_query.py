@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from policies import MAZE, MAZE_STATS, without_return
 
 from lerobot_unimask import UniMASKPolicy, cli, query
 from lerobot_unimask.data.episodes import read_window
@@ -192,23 +193,15 @@ def test_continuous_answers_have_means_and_scales(tiny_policy, continuous_batch)
     assert query.rows(policy, query.ask(tiny_policy("continuous"), "s[1] | s[0]", batch=batch))[0]["scale"] is None
 
 
-def test_without_a_mask_it_lists_what_can_be_asked(ask, tiny_policy):
+def test_without_a_mask_it_lists_what_can_be_asked(ask, tiny_policy, doorkey):
     said = ask()
     for word in ("behavior_cloning", "a[t] | s[:t+1], a[:t]", "s ####......  a ###?......", "agent_cell", "rtg[0]"):
         assert word in said
     result = json.loads(ask("--json"))
     assert result["factors"]["a"] == [{"component": "direction", "categories": 4}]
     assert result["factors"]["rtg"][0].keys() == {"component", "mean", "std"}
-    features = {key: value for key, value in DOORKEY.items() if key != "observation.return_to_go"}
-    tasks = query.overview(tiny_policy(features=features))["tasks"]
+    tasks = query.overview(tiny_policy(features=without_return(doorkey)))["tasks"]
     assert "reward_conditioned" not in [task["name"] for task in tasks]
-
-
-DOORKEY = {
-    "observation.state": {"dtype": "int64", "shape": (2,), "names": ["agent_cell", "key_cell"], "categories": [16, 16]},
-    "action": {"dtype": "int64", "shape": (1,), "names": ["direction"], "categories": [4]},
-    "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": None},
-}
 
 
 # --- Pictures --------------------------------------------------------------------------------------------------------
@@ -234,14 +227,7 @@ def test_a_maze_is_drawn_with_the_walls_of_its_data(tiny_policy, tmp_path):
     source = query.Source(tmp_path, tmp_path, None, episode=0, start=0)
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "provenance.json").write_text('{"maze": "umaze"}')
-    names = ["x", "y", "goal_x", "goal_y"]
-    features = {
-        "observation.state": {"dtype": "float32", "shape": (4,), "names": names},
-        "action": {"dtype": "float32", "shape": (2,), "names": None},
-    }
-    numbers = {"observation.state": 4, "action": 2}
-    stats = {key: {"mean": [0.0] * size, "std": [1.0] * size} for key, size in numbers.items()}
-    policy = tiny_policy("continuous", features=features, stats=stats)
+    policy = tiny_policy("continuous", features=MAZE, stats=MAZE_STATS)
     reply = query.ask(policy, "s[1:] | s[0]", given={"s[0]": [1, 1, 2, 2]})
     drawn = query.picture(policy, "s[1:] | s[0]", reply, source=source)
     assert len(drawn.axes[0].patches) == "".join(parse_maze("umaze").rows).count("#")

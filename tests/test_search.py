@@ -123,23 +123,6 @@ def test_dotted_names_lead_into_mappings():
     assert nested({"width": 8, "loss_weights.s": 0.5}) == {"width": 8, "loss_weights": {"s": 0.5}}
 
 
-def test_bad_settings_are_named(tmp_path, capsys):
-    for text, message in (
-        ("draws: 2", "space is empty"),
-        ("space: {widht: [8]}", "no setting 'widht'"),
-        ("space: {width: 8}", "space.width is 8: give a list of choices or"),
-        ("space: {optimizer_lr: {low: 1, hihg: 2}}", "space.optimizer_lr is"),
-        ("space: {width: [8]}\nenvironment: ant", "choose one of doorkey, maze2d"),
-        ("space: {width: [8]}\ndraws: 0", "draws is 0; it must be at least 1"),
-        ("space: {width: [8]}\nvariants: {}", "variants is empty"),
-        ("space: {width: [8]}\nseeds: []", "seeds is empty"),
-    ):
-        (tmp_path / "bad.yaml").write_text(text)
-        with pytest.raises(SystemExit):
-            cli.main(["paper", "search", f"--config_path={tmp_path / 'bad.yaml'}"])
-        assert message in capsys.readouterr().err
-
-
 def test_the_quick_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cli.main(["paper", "search", f"--config_path={CONFIGS / 'search_quick.yaml'}"])

@@ -189,3 +189,32 @@ def test_a_storage_that_cannot_be_opened_is_named_without_its_password(tmp_path,
     with pytest.raises(error, match=message) as raised:
         run_study("test", RUNS[:1], partial(sleep, 0), output=tmp_path, storage=storage)
     assert "secret" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("part", "text", "message"),
+    [
+        ("heatmap", "rows: [mlp]", "has no row 'mlp'"),
+        ("heatmap", "rows: [finetune]", "goes on from random_mask"),
+        ("heatmap", "seedz: [0]", "seedz"),
+        ("heatmap", "steps: many", "steps"),
+        ("table", "rows: [dt]", "has no row 'dt'"),
+        ("table", "rows: [unimask_multi_task_finetune]", "goes on from unimask_multi_task"),
+        ("search", "draws: 2", "space is empty"),
+        ("search", "space: {widht: [8]}", "no setting 'widht'"),
+        ("search", "space: {width: 8}", "space.width is 8: give a list of choices or"),
+        ("search", "space: {optimizer_lr: {low: 1, hihg: 2}}", "space.optimizer_lr is"),
+        ("search", "space: {width: [8]}\nenvironment: ant", "choose one of doorkey, maze2d"),
+        ("search", "space: {width: [8]}\ndraws: 0", "draws is 0; it must be at least 1"),
+        ("search", "space: {width: [8]}\nvariants: {}", "variants is empty"),
+        ("search", "space: {width: [8]}\nseeds: []", "seeds is empty"),
+        ("ablation", "seeds: []", "seeds is empty"),
+        ("ablation", "variants: {a/b: {}}", "leave '/' out"),
+        ("ablation", "steps: 0", "at least 1"),
+        ("ablation", "zero_hidden: zeros", "the variants are default"),
+        ("ablation", "rolouts: 3", "rolouts"),
+    ],
+)
+def test_a_wrong_setting_is_named(part, text, message, tmp_path, refused):
+    (tmp_path / "wrong.yaml").write_text(text)
+    assert message in refused("paper", part, f"--config_path={tmp_path / 'wrong.yaml'}")

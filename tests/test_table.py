@@ -34,17 +34,6 @@ def test_the_config_files_are_read(name):
     assert set(read_config(TableConfig, CONFIGS / f"{name}.yaml").rows) <= {*ROWS, *FINETUNED}
 
 
-def test_bad_settings_are_named(tmp_path, capsys):
-    for text, message in (
-        ("rows: [dt]", "has no row 'dt'"),
-        ("rows: [unimask_multi_task_finetune]", "goes on from unimask_multi_task"),
-    ):
-        (tmp_path / "bad.yaml").write_text(text)
-        with pytest.raises(SystemExit):
-            cli.main(["paper", "table", f"--config_path={tmp_path / 'bad.yaml'}"])
-        assert message in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_the_two_minute_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
