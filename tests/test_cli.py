@@ -101,23 +101,3 @@ def test_validate_prints_each_tasks_loss_and_writes_the_record(checkpoint, doork
     assert "forward_dynamics" in said
     assert "random_mask" in said
     assert '"command": "unimask validate --policy.path=' in record.read_text()
-
-
-def test_validate_refuses_what_is_not_a_run(refused, doorkey_root, tmp_path) -> None:
-    for folder in (tmp_path, tmp_path / "nowhere", doorkey_root):
-        said = refused("validate", "--policy.path", folder, "--dataset.root", doorkey_root)
-        assert str(folder) in said
-        assert "is neither a" in said
-        assert said.count("\n") == 1
-
-
-def test_validate_refuses_data_that_is_not_there(checkpoint, refused, tmp_path) -> None:
-    said = refused("validate", "--policy.path", checkpoint, "--dataset.root", tmp_path / "nowhere")
-    assert str(tmp_path / "nowhere") in said
-    assert not (tmp_path / "nowhere").exists()
-
-
-def test_validate_refuses_damaged_weights(checkpoint, refused, doorkey_root) -> None:
-    (checkpoint / "model.safetensors").write_bytes(b"not weights")
-    said = refused("validate", "--policy.path", checkpoint, "--dataset.root", doorkey_root)
-    assert "cannot be read as safetensors" in said

@@ -146,14 +146,6 @@ def test_each_window_is_asked_its_own_question():
     assert all(torch.equal(shown[name], before[name]) for name in shown)
 
 
-def test_the_same_seed_draws_the_same_samples():
-    mask = tabulate("s[:], a[:]", ("s", "a"), K).at(None, 50)
-    for order in ORDERS:
-        first, again, other = (outcome_numbers(draw(empty_window(50), mask, order, seed)) for seed in (1, 1, 2))
-        assert torch.equal(first, again)
-        assert not torch.equal(first, other)
-
-
 # --- Rejection -------------------------------------------------------------------------------------------------------
 
 
@@ -257,17 +249,6 @@ def test_an_answer_holds_the_networks_probabilities():
     assert best[0, 0].isnan()
     assert best[0, 1].item() == expected.index(max(expected))
     assert said.most_likely("a")[0, 0].item() == 2
-
-
-def test_a_draw_follows_the_probabilities():
-    mask = tabulate("s[:], a[:]", ("s", "a"), K).at(None, 6000)
-    said = answer(model(exact_network), empty_window(6000), mask)
-    drawn = said["a"][0].draw(torch.Generator().manual_seed(0))
-    assert drawn.shape == (6000, K, 1)
-    for step in range(K):
-        counts = drawn[:, step, 0].long().bincount(minlength=3).float()
-        statistic, df = chi_square(counts, said["a"][0].probabilities[0, step])
-        assert statistic < df + 5 * (2 * df) ** 0.5 + 10
 
 
 def test_a_tokens_numbers_are_answered_together():

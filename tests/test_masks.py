@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lerobot_unimask.language.grammar import MAX_CONTEXT, MAX_TEXT, MaskError
-from lerobot_unimask.language.masks import RANDOM_MASK, REGIMES, TASKS, Mask, Token, parse, parse_token, tabulate
+from lerobot_unimask.language.masks import RANDOM_MASK, REGIMES, TASKS, Token, parse, parse_token, tabulate
 
 FACTORS = ("s", "a", "rtg")
 QUESTIONS = [
@@ -159,17 +159,6 @@ def test_white_space_means_nothing():
     assert torch.equal(tabulate(" past\n", FACTORS, 7).asked, tabulate("past", FACTORS, 7).asked)
 
 
-def test_a_slice_with_t_is_clipped_and_never_wraps():
-    table = tabulate("a[0] | s[t-2:t+1]", FACTORS, 5)
-    drawings = [table.at(t).draw().split("  ")[0] for t in range(5)]
-    assert drawings == ["s #....", "s ##...", "s ###..", "s .###.", "s ..###"]
-
-
-def test_an_integer_with_t_rules_steps_out():
-    assert tabulate("a[t] | s[t-2], s[t+1]", FACTORS, 6).t.tolist() == [2, 3, 4]
-    assert tabulate("inverse_dynamics", FACTORS, 6).t.tolist() == [1, 2, 3, 4, 5]
-
-
 def test_a_table_answers_for_the_steps_that_it_admits():
     table = tabulate("past", FACTORS, 4)
     mask = table.at(3, batch_size=2)
@@ -296,13 +285,3 @@ def test_within_and_draw():
     inside = mask.within(valid)
     assert [inside.draw(0), inside.draw(1)] == ["s ###..#  a ##?...", "s ##....  a ##...."]
     assert mask.draw(1) == "s ###..#  a ##?..."  # the original is as it was
-
-
-def test_moving_a_mask_keeps_it():
-    mask = tabulate("past", FACTORS, 5).at(2)
-    moved = mask.to(torch.device("cpu"))
-    assert isinstance(moved, Mask)
-    assert moved.draw() == mask.draw()
-
-
-# --- Causal windows --------------------------------------------------------------------------------------------------

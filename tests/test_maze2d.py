@@ -412,12 +412,6 @@ def test_a_stored_episode_can_be_replayed(built):
     assert len(provenance["initial_velocity"]) == 6
 
 
-def test_a_replay_with_another_velocity_differs(built):
-    states = stored(built)["observation.state"][:HORIZON]
-    env = start(states[0, :2].tolist(), goal=states[0, 2:].tolist(), velocity=(0.5, 0.5))
-    assert np.abs(env.step(REST)[0]["agent_pos"][:2] - states[1, :2]).max() > 1e-5
-
-
 def test_builds_are_determined_by_their_seed_and_begin_alike(built, tmp_path):
     frames, smaller = stored(built), stored(build_maze2d(tmp_path / "two", episodes=2, seed=1, progress=False))
     for name, column in smaller.items():

@@ -14,7 +14,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from lerobot_unimask import MaskError, UniMASKPolicy
-from lerobot_unimask.language.training_masks import TrainingMasks
 
 
 def test_policy_and_config_are_found_by_name():
@@ -90,15 +89,6 @@ def test_processors_name_batch_and_place_but_leave_the_numbers(doorkey, tiny_pol
     assert observation["observation.state"].tolist() == [[3, 7]]
     action = policy.select_action(observation)
     assert torch.equal(postprocessor(action), action)
-
-
-def test_processors_are_saved_and_loaded(tiny_policy, doorkey, tmp_path):
-    policy = tiny_policy()
-    for processor in make_pre_post_processors(policy.config, dataset_stats=doorkey.meta.stats):
-        processor.save_pretrained(tmp_path)
-    preprocessor, postprocessor = make_pre_post_processors(policy.config, pretrained_path=str(tmp_path))
-    assert preprocessor({"observation.state": torch.tensor([3.0, 7.0])})["observation.state"].tolist() == [[3, 7]]
-    assert postprocessor(torch.tensor([[2]])).tolist() == [[2]]
 
 
 def test_forward_and_acting_leave_the_batch_alone(kind, tiny_policy, batch_of):
@@ -227,35 +217,6 @@ def test_padding_does_not_matter_to_the_loss(tiny_policy, continuous_batch):
         loss.backward()
         policy.update()
     assert all(parameter.grad.isfinite().all() for parameter in policy.parameters())
-
-
-def test_a_split_batch_sees_the_same_masks(tiny_policy, doorkey_batch, monkeypatch):
-    """However a batch is split over processes, a window is masked by its frame's index."""
-    policy, drawn = tiny_policy().train(), []
-    monkeypatch.setattr(
-        TrainingMasks,
-        "forward",
-        lambda self, *args, _f=TrainingMasks.forward, **kwargs: drawn.append(_f(self, *args, **kwargs)) or drawn[-1],
-    )
-    policy.forward(doorkey_batch)
-    policy.forward({key: value[3:5] for key, value in doorkey_batch.items()})
-    assert drawn[1].draw(0) == drawn[0].draw(3)
-    assert drawn[1].draw(1) == drawn[0].draw(4)
-    assert drawn[0].draw(3) != drawn[0].draw(4)
-
-
-def test_training_lowers_the_loss(tiny_policy, doorkey_batch):
-    policy = tiny_policy(training_masks="s[1] | s[0], a[0]").train()
-    optimiser = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
-    losses = []
-    for _ in range(60):
-        loss, _ = policy.forward(doorkey_batch)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        policy.update()
-        losses.append(loss.item())
-    assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
 
 
 def test_without_a_return_column_there_is_no_return_factor(doorkey, tiny_policy, doorkey_batch):

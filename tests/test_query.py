@@ -240,14 +240,6 @@ def test_with_json_only_the_json_is_printed(ask, tmp_path):
 # --- Where policies come from ----------------------------------------------------------------------------------------
 
 
-def test_a_training_run_stands_for_its_last_checkpoint(tiny_policy, tmp_path):
-    for updates in (10, 20):
-        tiny_policy().save_pretrained(tmp_path / "checkpoints" / f"{updates:06}" / "pretrained_model")
-    assert UniMASKPolicy.from_pretrained(str(tmp_path)).origin.repository == str(
-        tmp_path / "checkpoints" / "000020" / "pretrained_model"
-    )
-
-
 def test_a_policy_of_the_hub_is_named_with_its_commit(tiny_policy, tmp_path, monkeypatch):
     commit = "0123456789abcdef0123456789abcdef01234567"
     folder = tmp_path / "models--me--doorkey" / "snapshots" / commit

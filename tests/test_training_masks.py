@@ -128,55 +128,11 @@ def test_training_masks_are_those_of_a_loop_over_windows(masks):
         assert {(f, p) for f in FACTORS for p in drawn.asked[f][b].nonzero().flatten().tolist()} == asked
 
 
-@pytest.mark.parametrize("masks", MIXTURES)
-def test_nothing_outside_the_episode_and_nothing_twice(masks):
-    valid = ragged(2000, 10)
-    mask = TrainingMasks(masks, FACTORS, 10)(valid, torch.arange(2000), seed=0, step=0)
-    for name in FACTORS:
-        assert not (mask.shown[name] & ~valid).any()
-        assert not (mask.asked[name] & ~valid).any()
-        assert not (mask.shown[name] & mask.asked[name]).any()
-        assert mask.shown[name].dtype == torch.bool
-    assert not mask.asked["rtg"].any()
-    assert not mask.shown["rtg"][:, 1:].any()
-
-
-@pytest.mark.parametrize("length", [1, 4, 10])
-@pytest.mark.parametrize("task", ["behavior_cloning", "past", "future"])
-def test_t_is_uniform_among_the_steps_that_ask_for_something_valid(task, length):
-    B, K = 20_000, 10
-    valid = (torch.arange(K) < length).expand(B, K)
-    mask = TrainingMasks(task, FACTORS, K)(valid, torch.arange(B), seed=1, step=2)
-    # How many actions are shown or asked tells these masks apart.
-    count = mask.asked["a"].sum(1) if task == "past" else mask.shown["a"].sum(1)
-    if task == "past":
-        # t = 1 .. K - 1, the valid ones of its asked steps 0 .. t - 1: every t at or past the end asks for all of them.
-        observed = count.bincount(minlength=length + 1)[1:]
-        expected = torch.tensor([1.0] * (length - 1) + [K - length]) if length < K else torch.ones(K - 1)
-        observed = observed[: len(expected)]
-    else:
-        observed = count.bincount(minlength=length)
-        expected = torch.ones(length)
-    assert observed.sum() == B
-    if len(expected) > 1:
-        assert_frequencies(observed, expected)
-
-
 def test_a_window_that_no_question_fits_asks_for_nothing():
     valid = torch.arange(5) < torch.tensor([[1], [5]])
     mask = TrainingMasks("forward_dynamics", ("s", "a"), 5)(valid, torch.tensor([0, 1]), seed=0, step=0)
     assert mask.draw(0) == "s .....  a ....."
     assert "?" in mask.draw(1)
-
-
-def test_weights_are_respected():
-    weights = {"s[0] | s[1]": 1, "s[1] | s[2]": 3, "s[2] | s[3]": 0.5, RANDOM_MASK: 2}
-    B, K = 20_000, 6
-    mask = TrainingMasks(weights, ("s", "a"), K)(torch.ones(B, K, dtype=torch.bool), torch.arange(B), seed=0, step=0)
-    drawings = Counter(mask.draw(b) for b in range(B))
-    questions = ["s ?#....  a ......", "s .?#...  a ......", "s ..?#..  a ......"]
-    observed = [drawings[drawing] for drawing in questions]
-    assert_frequencies([*observed, B - sum(observed)], list(weights.values()))
 
 
 def test_multi_task_goes_without_the_return_where_there_is_none():

@@ -195,13 +195,6 @@ def test_a_folder_with_something_in_it_is_refused_and_left_as_it_was(tmp_path):
     assert list(tmp_path.iterdir()) == [root]
 
 
-def test_a_file_is_refused_and_left_as_it_was(tmp_path):
-    (tmp_path / "file").write_text("data")
-    with pytest.raises(FileExistsError, match="is a file"):
-        write(tmp_path / "file")
-    assert (tmp_path / "file").read_text() == "data"
-
-
 def test_what_appears_in_the_folder_meanwhile_is_left_as_it_was(tmp_path, monkeypatch):
     root = tmp_path / "late"
     finish = writer._finish_info
