@@ -1,5 +1,8 @@
 """What the tests of policies share: kinds of policies, recorded episodes, and how answers are compared."""
 
+from contextlib import contextmanager
+
+import pytest
 import torch
 
 from dataset_builders.doorkey import FEATURES
@@ -66,6 +69,15 @@ def doorkey_policy(features=FEATURES, **settings):
     config = UniMASKConfig(device="cpu", **SMALL, **settings)
     config.set_dataset_feature_metadata(features)
     return UniMASKPolicy(config)
+
+
+@contextmanager
+def few_draws():
+    """The panels' questions with few draws: a model that has learnt nothing takes all that it may."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"TRIES": 1, "DRAWN": 4}.items():
+            patch.setattr(f"lerobot_unimask.envs.doorkey.panels.{name}", value)
+        yield
 
 
 def without_return(doorkey):

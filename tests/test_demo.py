@@ -12,6 +12,7 @@ from pathlib import Path
 import commands
 import psutil
 import pytest
+from policies import few_draws
 
 from lerobot_unimask import UniMASKPolicy, demo
 from lerobot_unimask.language.masks import TASKS
@@ -59,7 +60,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, str]:
     """A demo of four updates and a few episodes: its folder, its record and what it printed itself."""
     output = tmp_path_factory.mktemp("demo") / "unimask-demo"
     printed = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+    with few_draws(), pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         for name, value in {"EPISODES": 40, "UNSEEN_EPISODES": 20, "ROLLOUTS": 3}.items():
             patch.setattr(demo, name, value)
         patch.setattr(demo, "COMMANDS", {script: commands.fresh(main) for script, main in demo.COMMANDS.items()})

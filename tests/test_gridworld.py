@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from policies import doorkey_policy
+from policies import doorkey_policy, few_draws
 
 from lerobot_unimask.envs.doorkey.episodes import rollout as expert_rollout
 from lerobot_unimask.envs.doorkey.optimum import Optimum
@@ -36,7 +36,8 @@ def policy():
 
 @pytest.fixture(scope="module")
 def panels(policy):
-    return {panel.name: panel for panel in five_panels(policy)}
+    with few_draws():
+        return {panel.name: panel for panel in five_panels(policy)}
 
 
 def test_a_rollout_plays_by_the_rules(policy):
@@ -129,9 +130,9 @@ def test_histories_drawn_backwards_are_possible_and_end_in_the_given_state(monke
     assert panel.achieved["tokens drawn"] - panel.achieved["rejected"] >= 20 * (2 * HORIZON - 2)
 
 
-def test_a_policy_that_draws_nothing_possible_has_an_empty_panel(policy, monkeypatch):
-    monkeypatch.setattr("lerobot_unimask.envs.doorkey.panels.TRIES", 1)
-    panel = backwards_panel(policy)
+def test_a_policy_that_draws_nothing_possible_has_an_empty_panel(policy):
+    with few_draws():
+        panel = backwards_panel(policy)
     assert (panel.states, panel.actions, panel.achieved) == ([], [], {"possible histories": 0})
 
 
