@@ -62,21 +62,21 @@ def build_doorkey(
     The same seed gives the same episodes, and a larger build begins with the episodes of a smaller one.
 
     Args:
-        root: The dataset's folder: new, or an existing empty one.
-        episodes: How many; each has 10 steps.
-        seed: Of the starts and the actions.
+        root: folder of the dataset: new, or an existing empty one.
+        episodes: number of episodes, each of 10 steps.
+        seed: number that starts and actions follow from.
         expert: "paper" or "released", see `expert_progress`.
-        repo_id: The dataset's name, `ME/NAME`; `local/doorkey` if None.
-        beta: The expert's rationality.
-        camera: Whether there is `observation.images.top`, a video of the grid as MiniGrid draws it.
-        progress: Show progress bars, on a terminal.
+        repo_id: name of the dataset, `ME/NAME`; `local/doorkey` if None.
+        beta: rationality of the expert.
+        camera: whether there is `observation.images.top`, a video of the grid as MiniGrid draws it.
+        progress: whether to show progress bars, on a terminal.
 
     Returns:
         The dataset's folder.
 
     Raises:
-        FileExistsError: If `root` exists and is not an empty folder; it is left as it was.
-        ValueError: If an argument is out of range.
+        FileExistsError: `root` exists and is not an empty folder; it is left as it was.
+        ValueError: an argument is out of range.
     """
     root = refuse_existing(root)  # now, rather than after the work
     if episodes < 1 or seed < 0:

@@ -116,13 +116,13 @@ def add_label(
     Booleans and whole numbers become categories (int64), other numbers stay numbers (float32).
 
     Args:
-        root: The dataset's folder.
-        name: The column's, `observation.NAME`: LeRobot reads windows of no other.
-        labeller: What to add; called with each episode in turn.
-        how: What it is, in words, for the dataset's `meta/provenance.json`.
-        output: Where to write the labelled dataset: new, or an existing empty folder; None: in place of the old one.
-        categories: How many, where not all of them occur.
-        progress: Show a progress bar, on a terminal.
+        root: folder of the dataset.
+        name: name of the column, `observation.NAME`: LeRobot reads windows of no other.
+        labeller: function of an episode that returns its label.
+        how: description of the label, for the dataset's `meta/provenance.json`.
+        output: folder for the labelled dataset, new or empty; None: the old one's place.
+        categories: number of categories, where not all of them occur.
+        progress: whether to show a progress bar, on a terminal.
 
     Returns:
         The labelled dataset's folder.

@@ -84,20 +84,20 @@ def build_maze2d(
     {"position": ..., "velocity": ..., "goal": ...})` starts the episode again, and its stored actions replay it.
 
     Args:
-        root: The dataset's folder: new, or an existing empty one.
-        noise: Standard deviation of the normal noise added to each action, before it is clipped to [-1, 1].
-        maze: Name or text, see `parse_maze`.
-        repo_id: The dataset's name, `ME/NAME`; `local/maze2d` if None.
-        camera: Whether there is `observation.images.top`, a video of the maze, the goal and the mass from above.
-        hide_goal: Whether the state is x and y alone.
-        progress: Show progress bars, on a terminal.
+        root: folder of the dataset: new, or an existing empty one.
+        noise: standard deviation of the normal noise added to each action, before it is clipped to [-1, 1].
+        maze: name or text of the maze, see `parse_maze`.
+        repo_id: name of the dataset, `ME/NAME`; `local/maze2d` if None.
+        camera: whether there is `observation.images.top`, a video of the maze, the goal and the mass from above.
+        hide_goal: whether the state is x and y, without the goal.
+        progress: whether to show progress bars, on a terminal.
 
     Returns:
         The dataset's folder.
 
     Raises:
-        FileExistsError: If `root` exists and is not an empty folder; it is left as it was.
-        ValueError: If an argument is out of range, or the maze bad.
+        FileExistsError: `root` exists and is not an empty folder; it is left as it was.
+        ValueError: an argument is out of range, or the maze bad.
     """
     root = refuse_existing(root)  # now, rather than after the work
     if episodes < 1 or seed < 0:

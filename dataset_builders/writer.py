@@ -58,26 +58,26 @@ def write_dataset(
     """Write a LeRobotDataset into `root`, completely or not at all.
 
     Args:
-        root: The dataset's folder: new, or an existing empty one.
-        repo_id: Its name, as in `ME/NAME`.
-        fps: Steps per second.
+        root: folder of the dataset: new, or an existing empty one.
+        repo_id: name of the dataset, as in `ME/NAME`.
+        fps: steps per second.
         features: LeRobot's description of each column: dtype, shape (D,), names, and `categories` for discrete ones.
-        columns: The same keys -> (N, D) arrays of those dtypes, episodes one after another. LeRobot's own columns
+        columns: the same keys -> (N, D) arrays of those dtypes, episodes one after another. LeRobot's own columns
             (timestamp, frame_index, episode_index, index, task_index) are added.
         lengths: (E,) steps in each episode; they sum to N.
-        task: The task in words: one text, or one for each episode.
-        robot_type: What acted.
-        provenance: How the data came about, for `meta/provenance.json` (info.json keeps no unknown keys); the package's
+        task: text of the task, one for all episodes or one for each.
+        robot_type: name of what acted.
+        provenance: origin of the data, for `meta/provenance.json` (info.json keeps no unknown keys); the package's
             version and the command line are added.
-        progress: Show a progress bar, on a terminal.
-        pictures: For each feature that is a video the N pictures, (H, W, 3) uint8, as they come.
+        progress: whether to show a progress bar, on a terminal.
+        pictures: feature that is a video -> its N pictures, (H, W, 3) uint8, as they come.
 
     Returns:
         `root`, as a path.
 
     Raises:
-        FileExistsError: If `root` exists and is not an empty folder; it is left as it was.
-        ValueError: If columns, features and lengths do not fit together, or a value is not finite.
+        FileExistsError: `root` exists and is not an empty folder; it is left as it was.
+        ValueError: columns, features and lengths do not fit together, or a value is not finite.
     """
     root = refuse_existing(root)
     lengths = np.asarray(lengths)
@@ -315,10 +315,10 @@ def _write_tables(
     """Write a table into chunk-xxx/file-xxx.parquet files, no episode divided, none much above LeRobot's size limit.
 
     Args:
-        path: Where, with the fields chunk_index and file_index.
+        path: pattern of the files' names, with the fields chunk_index and file_index.
         lengths: (E,) rows of each episode.
-        row_group: Rows of a row group; at least one episode's.
-        location: Names of two columns to add that say which chunk and file a row is in.
+        row_group: number of a row group's rows; at least one episode's.
+        location: names of two columns to add that say which chunk and file a row is in.
 
     Returns:
         The chunk index and the file index of each episode, both (E,) int64.

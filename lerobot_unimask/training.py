@@ -36,12 +36,12 @@ class Trainer:
     """A policy, its data and its optimiser; iterating makes one update after another and yields each one's loss.
 
     Args:
-        settings: of the policy, as `--policy.NAME=...`; over a checkpoint's own where one is given.
-        root: the dataset's folder.
-        seed: of the weights and of the data's order.
-        steps: updates to make.
-        checkpoint: to go on from (fine-tuning), else a new policy.
-        episodes: to train on, else all.
+        settings: settings of the policy, as `--policy.NAME=...`; with a checkpoint, those that replace its own.
+        root: folder of the dataset.
+        seed: number that the weights and the data's order follow from.
+        steps: number of updates to make.
+        checkpoint: folder of a policy to go on from (fine-tuning); None: a new policy.
+        episodes: numbers of those to train on; None: all.
 
     Raises:
         FileNotFoundError: there is no dataset in `root`.

@@ -28,9 +28,9 @@ class RejectionError(ValueError):
 class Samples(Window):
     """Drawn windows: shown and drawn values, NaN elsewhere; and what the check cost.
 
-    drawn: tokens drawn, those that the check rejected included.
-    rejected: of these, how many it rejected.
-    restarted: how often a sample started over because no value of a token passed the check.
+    drawn: number of tokens drawn, those that the check rejected included.
+    rejected: number of these that it rejected.
+    restarted: number of times that a sample started over because no value of a token passed the check.
     """
 
     drawn: int = 0
@@ -66,8 +66,8 @@ def sample(
         order: `forward` in time (s0, a0, s1, ...), `backward`, or `random` (one order for the whole batch).
         generator: source of the draws, on the window's device; None: torch's global one.
         check: tells which samples contradict themselves; called after each drawn token with the samples that drew it.
-        tries: how often one token is drawn before its sample starts over, and how often a sample starts before all is
-            given up.
+        tries: number of times that a token is drawn before its sample starts over, and that a sample starts before all
+            is given up.
 
     Raises:
         ValueError: an unknown order, or a check that what is shown fails.

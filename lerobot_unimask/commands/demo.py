@@ -14,8 +14,13 @@ def add(commands: Any) -> None:
         "demo",
         "ask the policy that comes with the package, then train another and ask it too: about four minutes",
     )
-    parser.add_argument("--output", type=Path, default=Path("unimask-demo"), help="folder to write to; new or empty")
-    parser.add_argument("--steps", type=positive, default=None, help="training updates, for a shorter or longer demo")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("unimask-demo"),
+        help="folder to write to, new or empty; default: %(default)s",
+    )
+    parser.add_argument("--steps", type=positive, default=None, help="training updates; default: 3000")
     parser.set_defaults(run=_run)
 
 

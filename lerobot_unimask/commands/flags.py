@@ -67,7 +67,9 @@ def policy_flags(parser: argparse.ArgumentParser, *, several: bool = False) -> N
         )
     else:
         parser.add_argument("--policy.path", required=True, dest="path", metavar="PATH", help=what)
-    parser.add_argument("--policy.revision", dest="revision", metavar="COMMIT", help="of a Hub repository")
+    parser.add_argument(
+        "--policy.revision", dest="revision", metavar="COMMIT", help="commit of the Hub repository; default: newest"
+    )
 
 
 def dataset_flags(

@@ -7,7 +7,7 @@ from lerobot_unimask.commands.flags import add_command, boolean
 
 
 def add(commands: Any) -> None:
-    parser = add_command(commands, "frames", "the decoded pictures of datasets, and the disk that they take")
+    parser = add_command(commands, "frames", "tell how much disk the decoded pictures of datasets take, or remove them")
     parser.add_argument(
         "--remove", type=boolean, default=False, metavar="true", help="remove them; training decodes them again"
     )

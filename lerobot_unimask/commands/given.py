@@ -18,7 +18,7 @@ def add(commands: Any) -> None:
         required=True,
         dest="episodes",
         metavar="0:50",
-        help="as many as lerobot-eval has environments, --eval.batch_size",
+        help="episodes, as many as lerobot-eval has environments, --eval.batch_size",
     )
     parser.add_argument("--tokens", default="s[-1]", help="single tokens, as in 's[3], s[-1]'; default: %(default)s")
     parser.set_defaults(run=_run)

@@ -14,7 +14,11 @@ def add(commands: Any) -> None:
     policy_flags(parser)
     dataset_flags(parser)
     parser.add_argument(
-        "--dataset.episodes", required=True, dest="episodes", metavar="900:1000", help="that it was not trained on"
+        "--dataset.episodes",
+        required=True,
+        dest="episodes",
+        metavar="900:1000",
+        help="episodes that it was not trained on",
     )
     parser.add_argument("--ahead", type=positive, default=5, help="steps to see ahead; default: %(default)s")
     output_flag(parser)

@@ -18,8 +18,8 @@ def add(commands: Any) -> None:
         metavar="DIR",
         help="a checkpoint, or a lerobot-train output folder, of which the last checkpoint counts",
     )
-    what.add_argument("--dataset.root", type=Path, dest="dataset", metavar="DIR")
-    parser.add_argument("--repo_id", required=True, metavar="ME/NAME")
+    what.add_argument("--dataset.root", type=Path, dest="dataset", metavar="DIR", help="the dataset's folder")
+    parser.add_argument("--repo_id", required=True, metavar="ME/NAME", help="its name on the Hub")
     parser.add_argument(
         "--results",
         type=Path,

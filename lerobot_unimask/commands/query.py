@@ -21,20 +21,24 @@ def add(commands: Any) -> None:
         help="""values of single tokens, as in '{"s[0]": [0, 9], "rtg[0]": 5}', instead of recorded ones""",
     )
     dataset_flags(parser, required=False)
-    parser.add_argument("--episode", type=int, help="of the dataset, to read what is shown from")
-    parser.add_argument("--start", type=int, help="the episode's step that the window begins at; default: 0")
+    parser.add_argument("--episode", type=int, help="recorded episode that shown values are read from")
+    parser.add_argument("--start", type=int, help="step of the episode that the window begins at; default: 0")
     parser.add_argument("--sample", type=positive, metavar="N", help="draw N joint samples instead of marginals")
     parser.add_argument(
-        "--order", choices=("forward", "backward", "random"), help="of drawing, with --sample; default: forward"
+        "--order",
+        choices=("forward", "backward", "random"),
+        help="order of the draws, with --sample; default: forward",
     )
-    parser.add_argument("--seed", type=int, help="of the samples; default: 0")
+    parser.add_argument("--seed", type=int, help="number that the samples follow from; default: 0")
     parser.add_argument(
-        "--check", metavar="NAME", help="draw again what contradicts the environment's rules, as dynamics or agreement"
+        "--check",
+        metavar="NAME",
+        help="rule, dynamics or agreement: what breaks it is drawn again",
     )
     parser.add_argument(
         "--exact",
         metavar="EXPERT",
-        help="set the exact optimum's marginals beside the model's, for data of this expert",
+        help="expert of the data, whose exact optimum is set beside the model: paper or released",
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the answer, into a .png, .svg or .pdf")
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")

@@ -11,7 +11,7 @@ def add(commands: Any) -> None:
     policy_flags(parser, several=True)
     dataset_flags(parser)
     parser.add_argument(
-        "--exact", metavar="EXPERT", help="set the exact optimum beside the models, for data of this expert (DoorKey)"
+        "--exact", metavar="EXPERT", help="expert of the data, whose exact optimum is set beside the models (DoorKey)"
     )
     output_flag(parser)
     parser.set_defaults(run=_run)

@@ -96,8 +96,8 @@ def open_dataset(
     """A dataset whose items are windows of a policy with this `UniMASKConfig`, its cameras those that it reads.
 
     Args:
-        root: the dataset's folder; None: the Hub's cache, by `repo_id`.
-        episodes: to load, else all.
+        root: folder of the dataset; None: the Hub's cache, by `repo_id`.
+        episodes: numbers of those to load; None: all.
 
     Raises:
         FileNotFoundError: there is no dataset in `root`.

@@ -159,7 +159,7 @@ class Factor:
 
     Attributes:
         components: its numbers, in the dataset's order.
-        outputs: how they are predicted.
+        outputs: what a network predicts of them.
     """
 
     name: str

@@ -56,7 +56,7 @@ def cached_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int], fold
 
     Args:
         size: height and width of the pictures.
-        folder: where the files are kept; None: `frames_folder()`.
+        folder: place of the files; None: `frames_folder()`.
 
     Raises:
         ValueError: no such camera, one that measures depth, or a frame that does not decode.

@@ -28,7 +28,7 @@ class TrainingMasks(nn.Module):
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
             of a task, `random_mask`, or a regime's name (`multi_task`: the eight tasks, sharing its weight; without a
             return factor, seven).
-        factors: the model's factors.
+        factors: names of the model's factors.
         context_length: K.
         causal_share: share of the windows that are causal.
         cameras: names of its cameras, whose tokens come after the factors'.
@@ -144,7 +144,7 @@ class TrainingMasks(nn.Module):
             valid: (B, K) bool, False past the episode's end.
             index: (B,) the windows' first frames. Together with `seed` and `step` it decides the mask, so that masks
                 do not depend on workers, on how a batch is split over processes, or on a restart.
-            step: how many updates have been made.
+            step: number of updates made so far.
         """
         B, K = valid.shape
         F = len(self.factors)

@@ -23,11 +23,11 @@ class FeedForward(nn.Module):
         its first is ever shown; every token has weights of its own, so there are no position embeddings.
 
     Args:
-        factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
-        fine_inputs: encode continuous values as `NumberEncoding` does.
-        width: of each token's embedding.
-        depth: hidden layers.
-        feedforward_width: of each hidden layer.
+        factors: parts of a step. Every factor is read; `s` and `a` are predicted.
+        fine_inputs: whether `NumberEncoding` encodes continuous values.
+        width: size of each token's embedding.
+        depth: number of hidden layers.
+        feedforward_width: size of each hidden layer.
     """
 
     def __init__(

@@ -65,7 +65,7 @@ def course(value: Tensor, shown: Tensor, causal: Tensor | bool) -> Tensor:
     Args:
         value: (B, K, d), 0 where hidden.
         shown: (B, K)
-        causal: for all or each window, (B,): only what is before counts.
+        causal: whether only what is before counts, for all windows or for each, (B,).
 
     Returns:
         (B, K, d)
@@ -148,7 +148,7 @@ class Heads(nn.ModuleDict):
     """A linear layer for each predicted factor. Answers are in full precision also under mixed precision.
 
     Args:
-        width: of what they read.
+        width: size of what they read.
         steps: number of steps that are predicted from one input.
     """
 

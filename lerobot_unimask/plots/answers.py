@@ -37,8 +37,8 @@ def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
     """One window's mask: a row for each factor, a column for each step; shown, asked for, or neither.
 
     Args:
-        mask: Of any questions and factors.
-        window: Which of the mask's windows.
+        mask: one of any questions and factors.
+        window: number of the mask's window that is drawn.
     """
     names = list(mask.shown)
     shown = np.stack([mask.shown[name][window].numpy(force=True) for name in names])  # (F, K)
@@ -72,9 +72,9 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
     """What a model of any factors says about each component at each step: probabilities, or means and scales.
 
     Args:
-        answer: To any question.
-        truth: What was recorded, to draw over it.
-        window: Which of the answer's windows.
+        answer: one to any question.
+        truth: recorded windows, to draw over it.
+        window: number of the answer's window that is drawn.
     """
     rows = [(name, distribution) for name in answer.distributions for distribution in answer[name]]
     rows = [(name, d) for name, d in rows if answer.mask.asked[name][window].any()]
@@ -145,12 +145,12 @@ def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -
     """How often each state and action occurs, over all windows and steps: recorded ones beside sampled ones, say.
 
     Args:
-        groups: Where they come from, for people -> windows, in the dataset's units. What is NaN or not valid is left
+        groups: name of a group, for people -> its windows, in the dataset's units. What is NaN or not valid is left
             out.
-        factors: The model's.
+        factors: factors of the model.
 
     Raises:
-        ValueError: Nothing that all groups have.
+        ValueError: there is nothing that all groups have.
     """
     parts = []  # of each number: its label, component, and each group's values
     for name in ASKABLE:

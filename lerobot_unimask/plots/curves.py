@@ -13,7 +13,7 @@ def learning_curves(record: Mapping[str, Any]) -> Figure:
     """Mean return against updates, one line for each run, with bars of one standard error.
 
     Args:
-        record: As `experiments.learning_curve` makes it.
+        record: one of `paper.learning_curve`.
     """
     figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -41,7 +41,7 @@ def cost_of_context(record: Mapping[str, Any]) -> Figure:
     """Return, cost of an update and latency against the context length, each with its standard error over seeds.
 
     Args:
-        record: As `experiments.ablation` makes it, of several context lengths.
+        record: one of `paper.ablation`, of several context lengths.
     """
     figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
     panels: dict[str, dict[str, str | None]] = {
@@ -81,7 +81,7 @@ def cost_of_growth(record: Mapping[str, Any]) -> Figure:
     """Time and peak memory of an update against context length, width, batch size and episodes, all else as it was.
 
     Args:
-        record: As `experiments.bench` makes it.
+        record: one of `bench.measuring.bench`.
     """
     names = {
         "context_length": "context length K",

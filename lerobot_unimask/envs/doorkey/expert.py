@@ -30,9 +30,9 @@ def expert_probabilities(
     """The noisy-rational expert's action probabilities, proportional to exp(beta C(a)); they depend on the door too.
 
     Args:
-        agent, key, door_open: States, of any shapes that broadcast to one shape (...).
-        expert: How C counts a bump, see `expert_progress`.
-        beta: Rationality; 0 is uniform.
+        agent, key, door_open: states, of any shapes that broadcast to one shape (...).
+        expert: name of the way in which C counts a bump, see `expert_progress`.
+        beta: rationality; 0 is uniform.
 
     Returns:
         (..., 4) float64, summing to one over the last axis.

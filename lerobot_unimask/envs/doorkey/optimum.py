@@ -192,8 +192,8 @@ def exact_answer(window: Window, mask: Mask, *, expert: Expert = "paper", first_
     """What the optimum answers to one mask, in place of what a policy's `infer` does.
 
     Args:
-        window: in the dataset's units; the return token (return-to-go, timestep / 10).
-        mask: over the same windows.
+        window: values in the dataset's units; the return token is (return-to-go, timestep / 10).
+        mask: question about the same windows.
         expert, first_step: see `Optimum`.
 
     Raises:

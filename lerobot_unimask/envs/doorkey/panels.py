@@ -63,17 +63,17 @@ class Panel:
     """One question and the N trajectories that answer it, as plain lists.
 
     Attributes:
-        name: What the question is about, for people.
-        question: In the mask language.
-        given: Values of single tokens, {"s[-1]": [agent cell, key cell], "rtg[0]": 4.0}.
+        name: what the question is about, for people.
+        question: text in the mask language.
+        given: values of single tokens, {"s[-1]": [agent cell, key cell], "rtg[0]": 4.0}.
         states: (N, K, 2) agent and key cells, s[0] to s[K-1].
         actions: (N, K) of a rollout, which also has the action after the last state; (N, K - 1) of samples.
-        achieved: What came of it. Of rollouts, a list with one entry for each: `return`, `success`, and for each given
+        achieved: what came of it. Of rollouts, a list with one entry for each: `return`, `success`, and for each given
             state whether they were in it at its step, as in `s[-1] reached`. Of samples: how many `possible histories`
             were found, and of these how many `tokens drawn`, those included that were `rejected` as impossible.
-        share: Of `DRAWN` rollouts from the same start, with actions drawn from the answers, the share that did what was
-            asked: it reached the given state, was paid the given return, or, where nothing is given, the goal. A given
-            one would always be met if the policy were exact. None of samples.
+        share: part of `DRAWN` rollouts from the same start, with drawn actions, that did what was asked: reached
+            the given state, were paid the given return, or, where nothing is given, reached the goal. A given one would
+            always be met if the policy were exact. None of samples.
     """
 
     name: str
@@ -90,11 +90,11 @@ def five_panels(policy: UniMASKPolicy, *, seed: int = 0) -> list[Panel]:
     sampled backwards.
 
     Args:
-        policy: Trained on DoorKey, with a window of 10 steps.
-        seed: Of the samples and of drawn actions.
+        policy: one trained on DoorKey, with a window of 10 steps.
+        seed: number that samples and drawn actions follow from.
 
     Raises:
-        ValueError: The policy's window is not one episode.
+        ValueError: the policy's window is not one episode.
     """
     if policy.config.context_length != HORIZON:
         raise ValueError(
@@ -121,7 +121,7 @@ def did_as_asked(achieved: Mapping[str, Sequence[float]], given: Given) -> np.nd
     """Which rollouts reached every given state and were paid the given return, or, where nothing is given, succeeded.
 
     Args:
-        achieved: As in a `Panel` of N rollouts.
+        achieved: what came of N rollouts, see `Panel`.
 
     Returns:
         (N,) bool.
@@ -135,11 +135,11 @@ def backwards_panel(policy: UniMASKPolicy, *, histories: int = 3, seed: int = 0)
     """Sample possible histories of a final state from the end to the start: a[K-2], s[K-2], a[K-3], ..., s[0].
 
     Note: No model is exact, so some tokens contradict the environment; as in the paper, they are drawn again. A model
-        that has hardly learnt anything seldom draws others: of it there may be no history.
+        that has hardly learnt anything seldom draws others: it may have no history.
 
     Args:
-        histories: How many.
-        seed: Of the samples.
+        histories: number of them.
+        seed: number that the samples follow from.
     """
     states, actions, achieved = [], [], {"possible histories": 0}
     with contextlib.suppress(RejectionError):
@@ -163,7 +163,7 @@ def predicted_states(policy: UniMASKPolicy, shown: Mapping[int, Sequence[int]] |
     """Every other state's distribution given the states of a few steps; nothing is said about actions.
 
     Args:
-        shown: Step -> [agent cell, key cell]; the paper's steps 0, 3 and 6 by default. Another episode's states do too.
+        shown: step -> [agent cell, key cell]; by default the paper's steps 0, 3 and 6.
 
     Returns:
         The answer about one window; `answer["s"]` has the agent's distribution, (1, K, 16), and the key's.
@@ -187,16 +187,16 @@ def rollout(
 
     Args:
         starts: N times [agent cell, key cell].
-        question: A mask that asks for a[t].
-        given: Values of single tokens, shared or one per episode.
-        sample: Draw the actions instead of taking the most likely ones.
-        seed: Of those draws.
+        question: mask that asks for a[t].
+        given: values of single tokens, shared or one per episode.
+        sample: whether actions are drawn; otherwise the most likely ones are taken.
+        seed: number that the draws follow from.
 
     Returns:
         What the expert's rollouts are made of too; the states include the one after the last action.
 
     Raises:
-        ValueError: A start that the environment does not have; a question that cannot be asked at every step.
+        ValueError: a start that the environment does not have; a question that cannot be asked at every step.
     """
     envs = [DoorKeyEnv(render_mode=None) for _ in starts]
     observations = [

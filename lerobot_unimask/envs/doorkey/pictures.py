@@ -108,10 +108,10 @@ def trajectories(
     """Trajectories that answer different questions, a grid for each, with jitter (the paper's property figure).
 
     Args:
-        groups: What was asked, for people -> (N, T, 2) agent and key cells.
-        captions: A line below each grid.
-        cell: One to mark, of which the questions speak.
-        most: How many of each group are drawn; the first ones.
+        groups: question, for people -> (N, T, 2) agent and key cells.
+        captions: line below each grid.
+        cell: cell to mark, of which the questions speak.
+        most: number of trajectories of each group that are drawn, the first ones.
     """
     width = min(WIDTH, 2.7 * len(groups) + 0.9)
     figure = Figure(figsize=(width, 3.1), layout="constrained")
@@ -239,11 +239,11 @@ def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
     likelier. Shown states have a frame.
 
     Args:
-        answer: To a question about `s`, with probabilities for every step, as `predicted_states` gives.
-        window: Which of the answer's windows.
+        answer: one to a question about `s`, with probabilities for every step, as `predicted_states` gives.
+        window: number of the answer's window that is drawn.
 
     Raises:
-        ValueError: The answer says nothing about some steps.
+        ValueError: the answer says nothing about some steps.
     """
     parts = (part for part in answer["s"] if isinstance(part, DiscreteDistribution))
     agent, key = (part.probabilities[window].numpy(force=True) for part in parts)  # (K, 16) each

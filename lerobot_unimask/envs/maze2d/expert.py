@@ -41,8 +41,8 @@ class WaypointExpert:
     The action is 10 (waypoint - position) - velocity, clipped to [-1, 1] per axis.
 
     Args:
-        position: where the episode starts, (x, y); rounded, a free cell.
-        rng: moves every waypoint but the goal by -U(0, 0.2) per axis.
+        position: start of the episode, (x, y); rounded, a free cell.
+        rng: source of the shifts by which every waypoint but the goal is moved, -U(0, 0.2) per axis.
     """
 
     def __init__(self, maze: Maze, position: tuple[float, float], goal: Cell, rng: np.random.Generator):

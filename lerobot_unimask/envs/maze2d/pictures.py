@@ -60,10 +60,10 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
     An ellipse reaches two scales to each side of a mean; a model with an L2 head has no scales, and no ellipses.
 
     Args:
-        answer: To a question about `s` of a Maze2D model.
-        truth: The recorded way, to draw beside it.
-        maze: Its name or text.
-        window: Which of the answer's windows.
+        answer: one to a question about `s` of a Maze2D model.
+        truth: recorded windows, to draw beside it.
+        maze: name or text of the maze.
+        window: number of the answer's window that is drawn.
     """
     (state,) = (part for part in answer["s"] if isinstance(part, ContinuousDistribution))
     mean = state.most_likely[window].numpy(force=True)  # (K, 4): x, y, goal x, goal y

@@ -38,7 +38,7 @@ def draw_maze(maze: Maze, goal: Cell, trail: Sequence[tuple[float, float]]) -> n
     """Draw a maze from above as its text reads: x downwards, y to the right.
 
     Args:
-        goal: its cell; the halo is the success distance.
+        goal: cell of the goal; its halo is the success distance.
         trail: the mass's positions so far, the present one last.
 
     Returns:
