@@ -74,20 +74,21 @@ def _read_as_this_policy_needs() -> None:
 
     @functools.wraps(lerobots_make_dataset)
     def make_dataset(cfg: TrainPipelineConfig) -> LeRobotDataset:
-        if cfg.dataset.streaming and cfg.trainable_config.type == "unimask":
+        if cfg.trainable_config.type != "unimask":
+            return lerobots_make_dataset(cfg)
+        if cfg.dataset.streaming:
             raise ValueError(
                 "unimask does not train on streamed datasets: LeRobot's streams do not give it whole windows. Leave "
                 "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
                 "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
             )
         root = Path(cfg.dataset.root or "")
-        if cfg.trainable_config.type == "unimask" and cfg.dataset.root and (root / "meta" / "info.json").exists():
+        if cfg.dataset.root and (root / "meta" / "info.json").exists():
             read_info(root)  # a damaged one ends in one sentence
         dataset = lerobots_make_dataset(cfg)
-        if cfg.trainable_config.type == "unimask":
-            opened[:] = [dataset]
-            reads.read_cameras(dataset, cfg.trainable_config)
-        if cfg.trainable_config.type == "unimask" and cfg.num_workers and getattr(dataset, "__getitems__", None):
+        opened[:] = [dataset]
+        reads.read_cameras(dataset, cfg.trainable_config)
+        if cfg.num_workers and getattr(dataset, "__getitems__", None):
             logger.info("Windows are read in batches, faster than workers start: num_workers=0.")
             cfg.num_workers = 0
         return dataset

@@ -13,7 +13,7 @@ from lerobot_unimask.bench import clock, measuring
 from lerobot_unimask.bench.measuring import CONFIGS, QUICK, Stopwatch, alone, spread
 from lerobot_unimask.bench.tables import markdown, targets
 from lerobot_unimask.cli import main
-from lerobot_unimask.plots.curves import cost_of_growth
+from lerobot_unimask.plots.growth import cost_of_growth
 
 ROOT = Path(__file__).parents[1]
 RECORD = ROOT / "docs" / "results" / "bench.json"

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from lerobot_unimask.paper.learning_curve import learning_curve
-from lerobot_unimask.plots.curves import learning_curves
+from lerobot_unimask.paper.learning_curve import learning_curve, learning_curves
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 
 

@@ -27,7 +27,7 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.bench.measuring import bench
     from lerobot_unimask.bench.tables import markdown
-    from lerobot_unimask.plots.curves import cost_of_growth
+    from lerobot_unimask.plots.growth import cost_of_growth
     from lerobot_unimask.records import write_json
 
     if arguments.device:

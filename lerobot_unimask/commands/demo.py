@@ -20,7 +20,7 @@ def add(commands: Any) -> None:
         default=Path("unimask-demo"),
         help="folder to write to, new or empty; default: %(default)s",
     )
-    parser.add_argument("--steps", type=positive, default=None, help="training updates; default: 3000")
+    parser.add_argument("--steps", type=positive, default=None, help="training updates, for a shorter or longer demo")
     parser.set_defaults(run=_run)
 
 

@@ -124,8 +124,7 @@ def _chunks(arguments: argparse.Namespace) -> None:
 
 
 def _curve(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.paper.learning_curve import learning_curve
-    from lerobot_unimask.plots.curves import learning_curves
+    from lerobot_unimask.paper.learning_curve import learning_curve, learning_curves
     from lerobot_unimask.records import write_json
 
     record = learning_curve(

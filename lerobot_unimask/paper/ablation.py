@@ -11,12 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask.data.episodes import open_dataset
 from lerobot_unimask.measures import latency, measure
 from lerobot_unimask.paper.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
 from lerobot_unimask.paper.table import QUESTIONS, maze_returns, mean_return
-from lerobot_unimask.plots.curves import cost_of_context
+from lerobot_unimask.plots.style import COLOURS, FAINT, SMALL, WIDTH
 from lerobot_unimask.training import Trainer
 
 
@@ -167,3 +169,43 @@ def _text(cell: Mapping[str, float] | None, digits: int) -> str:
         return ""
     error = f" ± {cell['standard_error']:.{digits}f}" if cell["standard_error"] else ""
     return f"{cell['mean']:.{digits}f}{error}"
+
+
+def cost_of_context(record: Mapping[str, Any]) -> Figure:
+    """Return, cost of an update and latency against the context length, each with its standard error over seeds.
+
+    Args:
+        record: one of `ablation`, of several context lengths.
+    """
+    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    panels: dict[str, dict[str, str | None]] = {
+        "mean return": {"behavior_cloning": "imitation", "reward_conditioned": "reward-conditioned"},
+        "processor time per update (ms)": {"ms_per_update": None},
+        "time per action (ms)": {"latency_ms": None},
+    }
+    lengths = record["config"]["context_lengths"]
+    for axes, (title, quantities) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        for variant in record["config"]["variants"]:
+            for (quantity, label), marker in zip(quantities.items(), "os", strict=False):
+                cells = [record["summary"][f"{variant}, K = {K}"][quantity] for K in lengths]
+                many = len(record["config"]["variants"]) > 1
+                axes.errorbar(
+                    lengths,
+                    [cell["mean"] for cell in cells],
+                    [cell["standard_error"] for cell in cells],
+                    color=COLOURS[list(quantities).index(quantity)],
+                    marker=marker,
+                    markersize=4,
+                    linewidth=1.2,
+                    capsize=2,
+                    label=", ".join(filter(None, [variant if many else None, label])),
+                )
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(lengths, [str(K) for K in lengths])
+        axes.set_xlabel("context length K")
+        axes.set_title(title, fontsize=SMALL)
+        if not title.startswith("mean"):
+            axes.set_ylim(bottom=0)
+        axes.grid(color=FAINT)
+    figure.axes[0].legend(fontsize=SMALL)
+    return figure

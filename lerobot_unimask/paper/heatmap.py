@@ -31,8 +31,8 @@ from lerobot_unimask.language.masks import RANDOM_MASK, TASKS
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
 from lerobot_unimask.networks.layers import by_component
 from lerobot_unimask.paper.early_stopping import train_to_lowest
+from lerobot_unimask.paper.heatmap_panels import Panel, heatmaps
 from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, run_study, write_results
-from lerobot_unimask.plots.heatmaps import Panel, heatmaps
 from lerobot_unimask.training import Trainer
 from lerobot_unimask.validation import answered, task_losses
 

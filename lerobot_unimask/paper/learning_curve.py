@@ -1,11 +1,15 @@
 """Return against updates: every checkpoint of a run, rolled out with LeRobot's own evaluation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from lerobot_unimask.data.checkpoints import checkpoints_of, training_settings
 from lerobot_unimask.evaluating import rollout
+from lerobot_unimask.plots.style import COLOURS, FAINT, SMALL, WIDTH
 from lerobot_unimask.records import versions
 
 
@@ -52,3 +56,31 @@ def _seconds_per_update(checkpoints: Sequence[Path], points: Sequence[dict[str, 
         return None
     first, last = ((path / "model.safetensors").stat().st_mtime for path in (checkpoints[0], checkpoints[-1]))
     return round((last - first) / (points[-1]["updates"] - points[0]["updates"]), 4)
+
+
+def learning_curves(record: Mapping[str, Any]) -> Figure:
+    """Mean return against updates, one line for each run, with bars of one standard error.
+
+    Args:
+        record: one of `learning_curve`.
+    """
+    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for run, colour, marker in zip(record["runs"], cycle(COLOURS), cycle("os^Dvx"), strict=False):
+        points = run["checkpoints"]
+        axes.errorbar(
+            [point["updates"] for point in points],
+            [point["mean_return"] for point in points],
+            [point["standard_error"] for point in points],
+            color=colour,
+            marker=marker,
+            markersize=4,
+            linewidth=1.2,
+            capsize=2,
+            label=run["run"],
+        )
+    axes.set_xlabel("updates")
+    axes.set_ylabel("mean return")
+    axes.grid(color=FAINT)
+    axes.legend(fontsize=SMALL)
+    return figure

@@ -18,11 +18,11 @@ class Panel:
 
     title: str
     numbers: Tensor
-    # (R, C), what is written in the cells; NaN: nothing.
+    """(R, C), what is written in the cells; NaN: nothing."""
     colours: Tensor | None = None
-    # (R, C), what colours them, from 1 to 2; None: the numbers.
+    """(R, C), what colours them, from 1 to 2; None: the numbers."""
     signed: bool = False
-    # Coloured from -1 to 1 instead, and written with their signs.
+    """Whether they are coloured from -1 to 1 instead, and written with their signs."""
 
 
 def heatmaps(panels: Sequence[Panel], rows: Sequence[str], columns: Sequence[str]) -> Figure:
