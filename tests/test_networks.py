@@ -13,7 +13,7 @@ from lerobot_unimask.networks.losses import masked_losses
 from lerobot_unimask.networks.transformer import Transformer
 
 B, K = 3, 5
-LAYOUTS = ("stacked", "separate", "stacked, plain inputs")
+LAYOUTS = ("stacked", "separate", "stacked, plain inputs", "feedforward")  # of the transformer, and the perceptron
 KINDS = {
     "discrete": {
         "s": [Feature("observation.state", 2, [7, 4])],
@@ -33,18 +33,11 @@ KINDS = {
 def make_network(kind, layout, dropout=0.0):
     factors = make_factors(KINDS[kind], joint=kind == "mixed")
     torch.manual_seed(0)
-    network = Transformer(
-        factors,
-        context_length=K,
-        stacked="stacked" in layout,
-        residuals="plain" not in layout,
-        fine_inputs="plain" not in layout,
-        width=16,
-        depth=2,
-        heads=2,
-        feedforward_width=16,
-        dropout=dropout,
-    )
+    sizes = {"context_length": K, "width": 16, "depth": 2, "feedforward_width": 16, "dropout": dropout}
+    if layout == "feedforward":
+        return FeedForward(factors, fine_inputs=True, **sizes).eval(), factors
+    stacked, fine = "stacked" in layout, "plain" not in layout
+    network = Transformer(factors, stacked=stacked, residuals=fine, fine_inputs=fine, heads=2, **sizes)
     return network.eval(), factors
 
 
