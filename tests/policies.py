@@ -5,8 +5,6 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from dataset_builders.doorkey import FEATURES
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.language.training_masks import TrainingMasks
 
 CONTINUOUS_FEATURES = {
@@ -63,11 +61,14 @@ def assert_same_answers(one, other, exactly=True):
         torch.testing.assert_close(a, b, **({"rtol": 0, "atol": 0} if exactly else {"rtol": 1e-4, "atol": 1e-5}))
 
 
-def doorkey_policy(features=FEATURES, **settings):
+def doorkey_policy(features=None, **settings):
     """An untrained DoorKey policy that scales nothing, as the exact optimum reads its windows."""
+    from dataset_builders.doorkey import FEATURES
+    from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+
     torch.manual_seed(0)
     config = UniMASKConfig(device="cpu", **SMALL, **settings)
-    config.set_dataset_feature_metadata(features)
+    config.set_dataset_feature_metadata(features or FEATURES)
     return UniMASKPolicy(config)
 
 
