@@ -42,7 +42,7 @@ def test_each_run_is_done_once_and_never_again(tmp_path, capsys):
     records = run_study("test", RUNS[:3], partial(sleep, 0), output=tmp_path)
     assert [{name: record[name] for name in run} for record, run in zip(records, RUNS[:3], strict=True)] == RUNS[:3]
     assert records[2]["loss"] == 2
-    assert records[0].keys() >= {"token", "wall_seconds", "versions"}
+    assert records[0].keys() >= {"token", "wall_seconds", "processor_seconds", "commit", "machine", "versions"}
     assert "3 of 3 runs done: row-50-2, loss 2.0000" in capsys.readouterr().out
     more = run_study("test", RUNS[:5], partial(sleep, 0), output=tmp_path)  # the grid has grown
     assert more[:3] == records

@@ -7,14 +7,12 @@ import functools
 import multiprocessing
 import os
 import resource
-import subprocess
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,10 +75,3 @@ def now() -> float:
 def spread(values: Sequence[float]) -> dict[str, Any]:
     low, median, high = np.quantile(np.asarray(values, dtype=float), [0.25, 0.5, 0.75]).tolist()
     return {"median": median, "quartiles": [low, high], "repeats": len(values)}
-
-
-def commit() -> str | None:
-    """The repository's commit, with `-dirty` where files have been changed since; None: it is no repository."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
-    return done.stdout.strip() if done.returncode == 0 else None

@@ -27,10 +27,10 @@ from torch.profiler import ProfilerActivity, profile
 
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import build_maze2d
-from lerobot_unimask.bench.clock import alone, commit, now, spread
+from lerobot_unimask.bench.clock import alone, now, spread
 from lerobot_unimask.bench.measuring import CONFIGS, WARM_UP, acting, check_configs, run_lerobot_train
 from lerobot_unimask.machine import describe_machine
-from lerobot_unimask.records import versions
+from lerobot_unimask.records import commit, versions
 
 STATE, ACTIONS, CONTEXT = 4, 2, 10  # numbers of Maze2D's states and actions, and steps of its window
 

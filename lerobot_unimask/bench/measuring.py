@@ -34,7 +34,7 @@ from torch.utils.data import default_collate
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import HORIZON, build_maze2d
 from lerobot_unimask import evaluating as lerobot_evaluation
-from lerobot_unimask.bench.clock import Stopwatch, alone, commit, now, spread
+from lerobot_unimask.bench.clock import Stopwatch, alone, now, spread
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import RETURN_SO_FAR
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
@@ -42,7 +42,7 @@ from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.machine import describe_machine
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.transformer import Transformer
-from lerobot_unimask.records import versions
+from lerobot_unimask.records import commit, versions
 from lerobot_unimask.training import Trainer
 
 WARM_UP = 2  # updates or calls that do not count

@@ -28,7 +28,8 @@ from optuna.distributions import BaseDistribution
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, TrialState
 
-from lerobot_unimask.records import versions, write_json
+from lerobot_unimask.machine import describe_machine
+from lerobot_unimask.records import commit, versions, write_json
 
 Run = dict[str, Any]  # what makes a run: JSON values
 
@@ -255,9 +256,16 @@ def _objective(trial: optuna.Trial, study: optuna.Study, execute: Execute, outpu
     elif path.exists():  # by one that died even before it could store it
         record = json.loads(path.read_text())
     else:
-        began = time.monotonic()
-        record = execute(run)
-        record = {**run, **record, "wall_seconds": round(time.monotonic() - began, 1), "versions": versions("optuna")}
+        began, processor = time.monotonic(), time.process_time()
+        record = {
+            **run,
+            **execute(run),
+            "wall_seconds": round(time.monotonic() - began, 1),
+            "processor_seconds": round(time.process_time() - processor, 1),
+            "commit": commit(),
+            "machine": describe_machine(),
+            "versions": versions("optuna"),
+        }
     if not path.exists():
         write_json(path, record, say=False)
     trial.set_user_attr("record", record)
