@@ -2,11 +2,15 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from lerobot_unimask import TASKS, UniMASKPolicy, cli
 from lerobot_unimask.data.episodes import first_windows, open_dataset
+from lerobot_unimask.paper import early_stopping
+from lerobot_unimask.paper.early_stopping import train_to_lowest
 from lerobot_unimask.paper.heatmap import (
     FINETUNE,
     ROWS,
@@ -15,9 +19,9 @@ from lerobot_unimask.paper.heatmap import (
     heatmap,
     markdown,
     optimum_losses,
-    paper_losses,
 )
 from lerobot_unimask.paper.study import read_config
+from lerobot_unimask.paper.study_tables import paper_losses
 from lerobot_unimask.validation import task_losses
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -94,24 +98,56 @@ def test_the_optimum_is_below_every_model(config, record):
         assert all(cell["mean"] > record["optimum"][task] for task, cell in tasks.items())
 
 
+@pytest.mark.parametrize(("patience", "ends", "best"), [(1, 2, 1), (2, 5, 3), (3, 6, 3), (4, 7, 7), (None, 7, 7)])
+def test_training_ends_when_patience_does_and_keeps_the_best_weights(monkeypatch, patience, ends, best):
+    """A policy whose one weight counts updates, validated after each."""
+    losses = iter([3.0, 4.0, 2.0, 2.5, 2.5, 2.5, 1.0])
+    weight = torch.zeros(1)
+    policy = SimpleNamespace(
+        training_masks=SimpleNamespace(weights={"task": 1.0}),
+        state_dict=lambda: {"weight": weight},
+        load_state_dict=lambda state: weight.copy_(state["weight"]),
+    )
+
+    class Trainer:
+        steps = 7
+
+        def __init__(self) -> None:
+            self.policy = policy
+
+        def __iter__(self):
+            for _ in range(self.steps):
+                weight.add_(1)
+                yield 0.0
+
+    monkeypatch.setattr(early_stopping, "task_losses", lambda *_: {"task": next(losses)})
+    found = train_to_lowest(Trainer(), {}, every=1, patience=patience)
+    assert max(found["curve"]) == ends
+    assert weight.item() == found["updates"] == best
+
+
 def made_up(episodes: int) -> dict:
     """A record of two rows, of which one has no number for the past."""
-    cell = {task: {"mean": 1.5, "spread": 0.0, "seeds": 1} for task in TASKS}
-    other = {task: {"mean": 3.0, "spread": 0.0, "seeds": 1} for task in TASKS if task != "past"}
+    seed = {"standard_error": 0.0, "spread": 0.0, "seeds": 1}
+    cell = {task: {"mean": 1.5, **seed} for task in TASKS}
+    other = {task: {"mean": 3.0, **seed} for task in TASKS if task != "past"}
     config = {
-        "expert": "released", "validation_episodes": 1, "seeds": [0], "steps": 1, "batch_size": 1,
+        "rows": ["random_mask", "other", "third"], "expert": "released", "validation_episodes": 1, "seeds": [0],
+        "steps": 1, "batch_size": 1,
         "evaluate_every": 1, "finetune_steps": 1,
     }  # fmt: skip
     losses = {str(episodes): {"random_mask": cell, "other": other}}
     return {"config": config, "losses": losses, "optimum": dict.fromkeys(TASKS, 1)}
 
 
-def test_tables_show_the_difference_from_the_papers_numbers():
+def test_tables_show_the_papers_numbers_in_brackets():
     text = markdown(made_up(500))
     assert paper_losses(500)["random_mask"]["past"] == 4.95
     assert paper_losses(7) is None
-    assert "| `random_mask` | 1.500 (+0.31) | 1.500 (+0.36) |" in text
+    assert "| `random_mask` | 1.500 (1.19) | 1.500 (1.14) |" in text
     assert "| `other` | 3.000 | 3.000 | 3.000 | 3.000 |  | 3.000 |" in text
+    assert "| `third` |  |  |  |  |  |  |  |  | not run |" in text
+    assert "| `random_mask` | 1.00 (1.00) |" in text
     assert "| `other` | 2.00 | 2.00 | 2.00 | 2.00 |  | 2.00 |" in text
     assert "| `optimum` | 0.67 | 0.67 |" in text
 

@@ -50,6 +50,12 @@ def test_each_run_is_done_once_and_never_again(tmp_path, capsys):
     assert set(states_of(tmp_path)) == {key(run) for run in RUNS[:5]}
 
 
+def test_without_workers_nothing_is_run_and_what_is_done_is_returned(tmp_path):
+    done = run_study("test", RUNS[1:3], partial(sleep, 0), output=tmp_path)
+    assert run_study("test", RUNS[:4], partial(sleep, 0), output=tmp_path, workers=0) == done
+    assert len(states_of(tmp_path)) == 2
+
+
 def test_runs_of_other_settings_are_not_mixed_with_those_that_are_done(tmp_path):
     do = partial(run_study, "test", execute=partial(sleep, 0), output=tmp_path)
     done = do(runs=RUNS[:1], settings={"steps": 10, "variants.a": {"width": 16}})

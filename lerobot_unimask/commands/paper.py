@@ -20,7 +20,8 @@ def add(commands: Any) -> None:
     for name, what in STUDIES.items():
         study = add_command(parts, name, what)
         study.add_argument("--config_path", type=Path, required=True, metavar="YAML", help="as in configs/")
-        study.add_argument("--workers", type=positive, default=1, help="processes to start here; default: %(default)s")
+        workers = "processes to start here, 0 to write down what is done; default: %(default)s"
+        study.add_argument("--workers", type=int, choices=range(257), default=1, metavar="N", help=workers)
         study.add_argument(
             "--storage",
             metavar="URL",
@@ -31,6 +32,8 @@ def add(commands: Any) -> None:
     _add_questions(parts)
     _add_chunks(parts)
     _add_gallery(parts)
+    tables = add_command(parts, "tables", "write the tables of README.md and docs/ from their records")
+    tables.set_defaults(run=_tables, light=True)
 
 
 def _add_chunks(parts: Any) -> None:
@@ -158,6 +161,19 @@ def _questions(arguments: argparse.Namespace) -> None:
     print(summary(record))
     if arguments.output:
         write_json(arguments.output, {**record, "command": arguments.text})
+
+
+def _tables(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.paper.tables import pages, rewrite
+
+    for path in pages(Path()):
+        text = path.read_text()
+        written, unknown = rewrite(text, Path())
+        if written != text:
+            path.write_text(written)
+            print(f"written to {path}")
+        for head in unknown:
+            print(f"{path}: left as it is: {head}")
 
 
 def _gallery(arguments: argparse.Namespace) -> None:

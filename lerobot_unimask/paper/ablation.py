@@ -17,7 +17,8 @@ from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask.data.episodes import open_dataset
 from lerobot_unimask.measures import latency, measure
 from lerobot_unimask.paper.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
-from lerobot_unimask.paper.table import QUESTIONS, maze_returns, mean_return
+from lerobot_unimask.paper.study_tables import QUESTIONS, summary_table
+from lerobot_unimask.paper.table import maze_returns, mean_return
 from lerobot_unimask.plots.style import COLOURS, FAINT, SMALL, WIDTH
 from lerobot_unimask.training import Trainer
 
@@ -139,36 +140,13 @@ def _quantities(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, flo
 
 
 def markdown(record: Mapping[str, Any]) -> str:
-    """The summary as a table."""
+    """The summary as a table, and what it is of."""
     config = record["config"]
-    columns = {
-        "behavior_cloning": "imitation",
-        "reward_conditioned": "reward-conditioned",
-        "behavior_cloning_error": "error of the imitated action",
-        "reward_conditioned_error": "of the reward-conditioned one",
-        "error_ahead": f"error {config['ahead']} steps ahead",
-        "ms_per_update": "ms of processor per update",
-        "latency_ms": "ms per action",
-    }
-    digits = dict.fromkeys(columns, 2) | {"error_ahead": 4, "ms_per_update": 0, "latency_ms": 1}
-    digits |= {"behavior_cloning_error": 3, "reward_conditioned_error": 3}
-    lines = [
+    return (
         f"{config['steps']} updates of {config['batch_size']} windows, {len(config['seeds'])} seed(s), "
-        f"{config['rollouts']} rollouts each, ± standard error over seeds (of one seed, over rollouts).\n",
-        "| variant | " + " | ".join(columns.values()) + " |",
-        "| --- " * (1 + len(columns)) + "|",
-    ]
-    for row, cells in record["summary"].items():
-        texts = [_text(cells.get(name), digits[name]) for name in columns]
-        lines.append(f"| {row} | " + " | ".join(texts) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _text(cell: Mapping[str, float] | None, digits: int) -> str:
-    if cell is None:
-        return ""
-    error = f" ± {cell['standard_error']:.{digits}f}" if cell["standard_error"] else ""
-    return f"{cell['mean']:.{digits}f}{error}"
+        f"{config['rollouts']} rollouts each, ± standard error over seeds (of one seed, over rollouts).\n\n"
+        f"{summary_table(record)}\n"
+    )
 
 
 def cost_of_context(record: Mapping[str, Any]) -> Figure:

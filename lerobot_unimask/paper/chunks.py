@@ -18,7 +18,8 @@ from lerobot_unimask.asking.acting import new_memory, plan
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.evaluating import rollout
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.records import markdown_table, versions
+from lerobot_unimask.paper.study_tables import acting_table, real_time_table
+from lerobot_unimask.records import versions
 
 AGAIN = 4  # steps from one request for a chunk to the next, or the delay if it is longer
 
@@ -164,31 +165,5 @@ def _jumps(jumps: Tensor, seams: list[int]) -> dict[str, float]:
 
 def markdown(record: dict[str, Any]) -> str:
     """Both tables of a record."""
-    acting = markdown_table(
-        ("H", "carried out", "return", "success", "ms", "passes a step"),
-        (
-            (
-                row["chunk_size"],
-                row["n_action_steps"],
-                f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
-                f"{row['success']:.3f}",
-                f"{row['ms']:.1f}",
-                f"{row['passes']:.2f}",
-            )
-            for row in record["acting"]
-        ),
-    )
-    real_time = markdown_table(
-        ("delay", "mask", "return", "jump at seams", "99 %", "inside chunks", "99 %"),
-        (
-            (
-                row["delay"],
-                "with" if row["mask"] else "without",
-                f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
-                *(f"{row[name]:.3f}" for name in ("seam_mean", "seam_99", "inside_mean", "inside_99")),
-            )
-            for row in record["real_time"]["rows"]
-        ),
-    )
     own = f"The data's own steps: {record['data_mean']:.3f} on average, 99 % within {record['data_99']:.3f}."
-    return f"{acting}\n\n{real_time}\n\n{own}"
+    return f"{acting_table(record)}\n\n{real_time_table(record)}\n\n{own}"

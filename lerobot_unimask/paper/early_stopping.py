@@ -9,13 +9,20 @@ from lerobot_unimask.validation import task_losses
 
 
 def train_to_lowest(
-    trainer: Trainer, batch: dict[str, Tensor], *, every: int, count_start: bool = False
+    trainer: Trainer,
+    batch: dict[str, Tensor],
+    *,
+    every: int,
+    patience: int | None = None,
+    count_start: bool = False,
 ) -> dict[str, Any]:
     """Train, and end with the weights that had the lowest validation loss (the paper's early stopping).
 
     Args:
         batch: validation windows, a LeRobot batch.
         every: updates between validations.
+        patience: validations in a row, none of them the lowest so far, after which the training ends; None: it never
+            does.
         count_start: the weights from before the first update count too.
 
     Returns:
@@ -36,5 +43,7 @@ def train_to_lowest(
             curve[done] = validate()
             if curve[done] == min(curve.values()):
                 best = {name: value.clone() for name, value in policy.state_dict().items()}
+            elif patience and min(curve.values()) not in list(curve.values())[-patience:]:
+                break
     policy.load_state_dict(best)
     return {"loss": min(curve.values()), "updates": min(curve, key=curve.get), "curve": curve}

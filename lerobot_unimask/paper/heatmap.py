@@ -9,7 +9,6 @@ Note: The paper's losses are probably those of its authors' code (`expert=releas
     are slightly different ones; here they are the paper's definitions.
 """
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -32,13 +31,12 @@ from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMas
 from lerobot_unimask.networks.layers import by_component
 from lerobot_unimask.paper.early_stopping import train_to_lowest
 from lerobot_unimask.paper.heatmap_panels import Panel, heatmaps
-from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, run_study, write_results
+from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, mean_over_seeds, run_study, write_results
+from lerobot_unimask.paper.study_tables import losses_table, normalised_table, paper_losses
 from lerobot_unimask.training import Trainer
 from lerobot_unimask.validation import answered, task_losses
 
 FINETUNE = "finetune"
-
-PAPER = Path(__file__).parent / "paper"
 
 # The paper's other architectures, as settings over those of the config file; its Decision-GPT is the causal transformer
 ARCHITECTURES: dict[str, dict[str, Any]] = {
@@ -77,6 +75,8 @@ class HeatmapConfig(StudyConfig):
     finetune_steps: int = 1000
     evaluate_every: int = 250
     # Updates between validations, of which the best counts.
+    patience: int | None = None
+    # Validations in a row without a better one, after which a run ends; null: none does.
     validation_episodes: int = 1000
     finetune_policy: dict[str, Any] = field(default_factory=dict)
     # Settings that fine-tuning changes.
@@ -157,7 +157,7 @@ def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
     )
     policy = trainer.policy
     batch = first_windows(open_dataset(policy.config, _validation_root(config)))
-    lowest = train_to_lowest(trainer, batch, every=config.evaluate_every, count_start=tuned)
+    lowest = train_to_lowest(trainer, batch, every=config.evaluate_every, patience=config.patience, count_start=tuned)
     if run["row"] == RANDOM_MASK:
         policy.save_pretrained(_checkpoint(config, run))
     tasks = [run["task"]] if tuned else [task for task in answered(policy, batch) if task in TASKS]
@@ -184,61 +184,30 @@ def optimum_losses(config: HeatmapConfig) -> dict[str, float]:
 
 
 def _table(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Row -> task -> mean and spread (largest minus smallest) over seeds."""
+    """Row -> task -> mean, standard error and spread (largest minus smallest) over seeds."""
     found: dict[str, dict[str, list[float]]] = {}
     for record in records:
         for task, loss in record["losses"].items():
             found.setdefault(record["row"], {}).setdefault(task, []).append(loss)
     return {
-        row: {task: {"mean": sum(v) / len(v), "spread": max(v) - min(v), "seeds": len(v)} for task, v in tasks.items()}
+        row: {task: {**mean_over_seeds(v), "spread": max(v) - min(v)} for task, v in tasks.items()}
         for row, tasks in found.items()
     }
 
 
-def paper_losses(episodes: int) -> dict[str, dict[str, float]] | None:
-    """The paper's own numbers, row -> task -> loss; None for a number of episodes of which it gives none as numbers."""
-    path = PAPER / f"doorkey_heatmap_{episodes}.csv"
-    if not path.exists():
-        return None
-    with path.open() as file:
-        return {row["training"]: {task: float(row[task]) for task in TASKS} for row in csv.DictReader(file)}
-
-
 def markdown(record: Mapping[str, Any]) -> str:
-    """Tables of the losses, of the paper's and the difference, and of the losses over the lowest in each column."""
+    """Tables of the losses, and of the losses over the lowest in each column, for each number of episodes."""
     config = record["config"]
     text = [
         f"Validation losses in nats, `expert={config['expert']}`, {config['validation_episodes']} unseen episodes, "
-        f"mean of {len(config['seeds'])} seed(s). {config['steps']} updates of {config['batch_size']} windows, "
-        f"{config['finetune_steps']} more for finetune; of the weights after every {config['evaluate_every']} the best "
-        "on what they are trained on. In brackets: minus the paper's, where it gives a number. `optimum`: the lowest "
-        "possible in expectation.\n"
+        f"mean ± standard error over {len(config['seeds'])} seed(s). {config['steps']} updates of "
+        f"{config['batch_size']} windows, {config['finetune_steps']} more for finetune; of the weights after every "
+        f"{config['evaluate_every']} the best on what they are trained on. In brackets the paper's. `optimum`: the "
+        "lowest possible in expectation."
     ]
-    for episodes, rows in record["losses"].items():
-        paper = paper_losses(int(episodes)) or {}
-        text += [f"\n**{episodes} episodes**\n", _header(), "| --- " * (1 + len(TASKS)) + "|"]
-        for row, tasks in rows.items():
-            text.append(_row(row, [_cell(tasks.get(task), paper.get(row, {}).get(task)) for task in TASKS]))
-        text.append(_row("optimum", [f"{record['optimum'][task]:.3f}" for task in TASKS]))
-        text += ["\nDivided by the lowest of each column:\n", _header(), "| --- " * (1 + len(TASKS)) + "|"]
-        over_lowest = _normalised(_grid([*_means(rows), record["optimum"]])).tolist()
-        for row, values in zip([*rows, "optimum"], over_lowest, strict=True):
-            text.append(_row(row, ["" if math.isnan(value) else f"{value:.2f}" for value in values]))
-    return "\n".join(text) + "\n"
-
-
-def _header() -> str:
-    return _row("trained on", [task.replace("_", " ") for task in TASKS], code=False)
-
-
-def _row(name: str, cells: Sequence[str], *, code: bool = True) -> str:
-    return "| " + " | ".join([f"`{name}`" if code else name, *cells]) + " |"
-
-
-def _cell(ours: Mapping[str, float] | None, paper: float | None) -> str:
-    if ours is None:
-        return ""
-    return f"{ours['mean']:.3f}" + (f" ({ours['mean'] - paper:+.2f})" if paper is not None else "")
+    for episodes in record["losses"]:
+        text += [f"**{episodes} episodes**", losses_table(record, episodes), normalised_table(record, episodes)]
+    return "\n\n".join(text) + "\n"
 
 
 def _means(rows: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[dict[str, float]]:

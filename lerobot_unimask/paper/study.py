@@ -163,11 +163,11 @@ def run_study(
         settings: all else that the records depend on, JSON values; kept in `output/settings.json`.
         space: what each run's `drawn` values were drawn from, which Optuna's own tools then know.
         storage: a database's URL; None: `sqlite:///OUTPUT/study.db`.
-        workers: processes to start here; with 1 this process works itself.
+        workers: processes to start here; with 1 this process works itself, with 0 nothing is run.
         heartbeat: seconds.
 
     Returns:
-        The records, in the order of `runs`.
+        The records, in the order of `runs`; with 0 workers, of those that are done.
 
     Raises:
         ValueError: the folder holds runs of other settings.
@@ -180,13 +180,13 @@ def run_study(
     known = {
         key_of(trial) for trial in study.get_trials(deepcopy=False) if trial.state in (*_OPEN, TrialState.COMPLETE)
     }
-    for run in runs:
+    for run in runs if workers else ():
         if key(run) not in known:
             enqueue(study, run, space)
     arguments = (name, storage, execute, output, heartbeat)
     if workers == 1:
         work(*arguments)
-    else:
+    elif workers:
         context = multiprocessing.get_context("spawn")
         processes = [context.Process(target=_worker, args=arguments) for _ in range(workers)]
         for process in processes:
@@ -195,12 +195,12 @@ def run_study(
             process.join()
     done = {key_of(trial): trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.COMPLETE}
     missing = [key(run) for run in runs if key(run) not in done]
-    if missing:
+    if missing and workers:
         raise ChildProcessError(
             f"{len(missing)} of {len(runs)} runs were not finished: {', '.join(missing[:5])}. "
             "The same command goes on with them."
         )
-    return [done[key(run)].user_attrs["record"] for run in runs]
+    return [done[key(run)].user_attrs["record"] for run in runs if key(run) in done]
 
 
 def enqueue(study: optuna.Study, run: Run, space: Mapping[str, BaseDistribution] | None = None) -> None:

@@ -9,7 +9,6 @@ Note: The paper stops early by the evaluation's reward, which chooses by what is
 """
 
 import contextlib
-import csv
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -22,13 +21,10 @@ from lerobot_unimask.data.factors import RETURN_TO_GO, STATE
 from lerobot_unimask.data.returns import read_starts
 from lerobot_unimask.evaluating import rollout
 from lerobot_unimask.paper.study import Run, StudyConfig, check_rows, key, mean_over_seeds, run_study, write_results
+from lerobot_unimask.paper.study_tables import QUESTIONS, returns_table
 from lerobot_unimask.training import Trainer
 
-QUESTIONS = {"bc": "behavior_cloning", "rc": "reward_conditioned"}  # by their names in the paper's table
-
 BOTH = "both"
-
-PAPER = Path(__file__).parent / "paper" / "maze2d_table.csv"
 
 # Row -> settings of a model that answers both questions. Without training_masks: one model for each question.
 ROWS: dict[str, dict[str, Any]] = {
@@ -167,30 +163,12 @@ def mean_return(results: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return mean_over_seeds([result["mean_return"] for result in results], alone=results[0]["standard_error"])
 
 
-def paper_returns() -> dict[str, dict[str, float]]:
-    """The paper's own numbers, row -> column -> mean return, and its standard error under `COLUMN_se`."""
-    with PAPER.open() as file:
-        rows = list(csv.DictReader(file))
-    return {row.pop("model"): {name: float(value) for name, value in row.items()} for row in rows}
-
-
 def markdown(record: Mapping[str, Any]) -> str:
-    """The table, each cell this package's mean and standard error, then the paper's."""
-    config, paper = record["config"], paper_returns()
-    columns = [f"k{K}_{name}" for K in config["context_lengths"] for name in QUESTIONS]
-    lines = [
+    """The table, and what it is of."""
+    config = record["config"]
+    return (
         f"Maze2D, mean return ± standard error over {len(config['seeds'])} seed(s) (of one seed, over rollouts), "
         f"{config['rollouts']} rollouts each, {config['steps']} updates for every model and {config['finetune_steps']} "
         f"more for fine-tuned ones. In brackets the paper's. Expert {record['expert']:.2f}, bound "
-        f"{record['bound']:.2f}.\n",
-        "| model | " + " | ".join(f"{name[-2:].upper()}, K = {name[1:-3]}" for name in columns) + " |",
-        "| --- " * (1 + len(columns)) + "|",
-    ]
-    for row, cells in record["returns"].items():
-        texts = []
-        for column in columns:
-            cell, published = cells.get(column), paper.get(row, {}).get(column)
-            text = f"{cell['mean']:.2f} ± {cell['standard_error']:.2f}" if cell else ""
-            texts.append(text + (f" ({published:.2f})" if published is not None else ""))
-        lines.append(f"| `{row}` | " + " | ".join(texts) + " |")
-    return "\n".join(lines) + "\n"
+        f"{record['bound']:.2f}.\n\n{returns_table(record)}\n"
+    )

@@ -1,0 +1,264 @@
+"""The tables of README.md and docs/, written from their records.
+
+A page names records above a table, one in a line, and the table's head says what is shown of them:
+
+    <!-- from: docs/results/doorkey_500.json -->
+    | task | this policy | spread | paper, random-mask | best possible |
+"""
+
+import re
+import statistics
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_unimask.language.masks import TASKS
+from lerobot_unimask.paper import claims, study_tables
+from lerobot_unimask.records import markdown_table, read_json
+
+Record = Mapping[str, Any]
+
+UNDER_RECORDS = re.compile(r"((?:<!-- from: \S+ -->\n)+)((?:\|.*\n)+)")
+
+EVALUATED = re.compile(r"maze2d_k(\d+)(_s1)?_imitation")  # files of lerobot-eval, each followed by that of its returns
+
+
+def rewrite(page: str, root: Path) -> tuple[str, list[str]]:
+    """
+    Args:
+        root: the folder that the records' paths are relative to.
+
+    Returns:
+        The page, its tables written anew; and the heads of tables under records that are of no kind in `KINDS`, which
+        are left as they are.
+    """
+    unknown = []
+
+    def write(found: re.Match[str]) -> str:
+        paths, head = re.findall(r"from: (\S+)", found[1]), found[2].partition("\n")[0]
+        for kind, written in KINDS.items():
+            if re.match(rf"\| {kind}", head):
+                return found[1] + written(*({"path": path, **read_json(root / path)} for path in paths)) + "\n"
+        unknown.append(head)
+        return found[0]
+
+    return UNDER_RECORDS.sub(write, page), unknown
+
+
+def pages(root: Path) -> list[Path]:
+    """README.md and every page in docs/."""
+    return [root / "README.md", *sorted(root.glob("docs/*.md"))]
+
+
+def _cell(mean: float, error: float, digits: int = 2) -> str:
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"
+
+
+def _evaluated(record: Record) -> str:
+    """Mean return and its standard error, of lerobot-eval's eval_info.json."""
+    returns = [value for task in record["per_task"] for value in task["metrics"]["sum_rewards"]]
+    return _cell(statistics.mean(returns), statistics.stdev(returns) / len(returns) ** 0.5)
+
+
+# --- DoorKey ---------------------------------------------------------------------------------------------------------
+
+
+def _beside_the_papers_model(record: Record) -> str:
+    paper = study_tables.paper_losses(500)["random_mask"]
+    best = record["optimum"]["expected_losses"]
+    rows = (
+        (
+            f"`{task}`",
+            f"{record['mean'][task]:.3f}",
+            f"{record['spread'][task]:.3f}",
+            f"{paper[task]:g}",
+            f"{best[task]:.3f}",
+        )
+        for task in TASKS
+    )
+    return markdown_table(("task", "this policy", "spread", "paper, random-mask", "best possible"), rows)
+
+
+def _action_rules(*records: Record) -> str:
+    rows = (
+        (rule, f"{record['overall']['pc_success']:.1f} %", _evaluated(record))
+        for rule, record in zip(("most likely", "sampled"), records, strict=True)
+    )
+    return markdown_table(("action rule", "success", "mean return"), rows)
+
+
+def _beside_the_optimum(record: Record) -> str:
+    ours, best = record["mean"], record["optimum"]["losses"]
+    rows = ((f"`{task}`", f"{ours[task]:.3f}", f"{best[task]:.3f}", f"{ours[task] - best[task]:.3f}") for task in TASKS)
+    return markdown_table(("task", "this policy", "best possible", "difference"), rows)
+
+
+def _causal_share(both: Record, both_1: Record, random: Record, random_1: Record, stacked: Record) -> str:
+    def row(task: str) -> tuple[str, ...]:
+        causal, alone = ([found["mean"][task] for found in pair] for pair in ((both, both_1), (random, random_1)))
+        seeds = (", ".join(f"{loss:.3f}" for loss in losses) for losses in (causal, alone))
+        best = both["optimum"]["losses"][task]
+        return (
+            f"`{task}`",
+            *seeds,
+            f"{100 * (sum(causal) / sum(alone) - 1):+.1f} %",
+            f"{stacked['mean'][task]:.3f}",
+            f"{best:.3f}",
+        )
+
+    heads = ("task", "7.5 % causal", "random masks alone", "difference", "the same, stacked", "best possible")
+    return markdown_table(heads, map(row, TASKS))
+
+
+def _asked_rollouts(record: Record) -> str:
+    goals, visits = record["goals"], record["visits"]
+    rows = [
+        (
+            "reach a final state that the expert reaches with 1 to 10 %",
+            goals["reached"],
+            goals["reached_by_imitation"],
+            goals["reached_by_the_expert"],
+        ),
+        ("visit the corner, asked to", visits["asked_to"], visits["imitation"], visits["expert"]),
+        ("visit the corner, asked not to", visits["asked_not_to"], visits["imitation"], visits["expert"]),
+    ]
+    percent = ((what, *(f"{share:.1%}" for share in shares)) for what, *shares in rows)
+    return markdown_table(("sampled rollouts", "asked", "imitation", "expert"), percent)
+
+
+def _asked_returns(record: Record) -> str:
+    rows = (
+        (row["asked"], _cell(row["mean_return"], row["standard_error"]), row["rollouts"])
+        for row in record["returns"]["returns"]
+    )
+    return markdown_table(("return asked for", "mean return", "rollouts"), rows)
+
+
+def _backward(record: Record) -> str:
+    found = record["backward"]
+    rows = [("as they come", f"{found['unchecked']['impossible_steps']:,}", None)]
+    for check in ("dynamics", "agreement"):
+        rows.append(
+            (f"`--check={check}`", f"{found[check]['impossible_steps']:,}", f"{found[check]['acceptance']:.1%}")
+        )
+    return markdown_table(
+        (f"{found['samples']:,} histories sampled backwards", "impossible steps", "tokens accepted"), rows
+    )
+
+
+# --- Maze2D ----------------------------------------------------------------------------------------------------------
+
+
+def _both_questions(*records: Record) -> str:
+    def row(imitation: Record, asked: Record) -> tuple[str, ...]:
+        K, second = EVALUATED.search(imitation["path"]).groups()
+        return f"{K}, second seed" if second else K, _evaluated(imitation), _evaluated(asked)
+
+    return markdown_table(("K", "imitation", "reward-conditioned"), map(row, records[::2], records[1::2]))
+
+
+def _ahead(random: Record, acts: Record) -> str:
+    rows = [("the last displacement repeated five times", random["ahead"]["last_displacement_repeated"])]
+    for record, what in (
+        (random, "random masks alone, {} updates"),
+        (acts, "the model that acts too, {} updates, half of the windows causal"),
+    ):
+        rows.append((what.format(f"{record['policy']['updates']:,}"), record["ahead"]["model"]))
+    return markdown_table(("model, K = 10", "distance"), ((what, f"{distance:.4f}") for what, distance in rows))
+
+
+def _encoding(record: Record) -> str:
+    rows = (
+        (
+            row.partition(",")[0],
+            *(_cell(*_of(cells[question])) for question in ("behavior_cloning", "reward_conditioned")),
+            _cell(*_of(cells["error_ahead"]), digits=3),
+        )
+        for row, cells in record["summary"].items()
+    )
+    return markdown_table(("numbers", "imitation", "reward-conditioned", "distance three steps ahead"), rows)
+
+
+def _of(cell: Mapping[str, float]) -> tuple[float, float]:
+    return cell["mean"], cell["standard_error"]
+
+
+def _last_checkpoints(record: Record) -> str:
+    last = [(run["run"], run["checkpoints"][-1]) for run in record["runs"]]
+    rows = ((f"`{run}`", _cell(found["mean_return"], found["standard_error"])) for run, found in last)
+    return markdown_table(("config", "mean return"), rows)
+
+
+# --- Hours and size --------------------------------------------------------------------------------------------------
+
+
+def _hours(*records: Record) -> str:
+    def row(record: Record) -> tuple[str, ...]:
+        runs = record["runs"]
+        wall, processor = (
+            sum(run.get(f"{clock}_seconds", 0) for run in runs) / 3600 for clock in ("wall", "processor")
+        )
+        seeds = len({run["seed"] for run in runs})
+        machines = {run["machine"]["processor"] for run in runs if "machine" in run}
+        commits = {run["commit"][:7] for run in runs if run.get("commit")}
+        return (
+            f"`{Path(record['path']).name}`",
+            str(len(runs)),
+            str(seeds),
+            f"{wall:.1f}",
+            f"{processor:.1f}",
+            ", ".join(sorted(machines)),
+            ", ".join(sorted(commits)),
+        )
+
+    heads = (
+        "record",
+        "runs",
+        "seeds",
+        "hours",
+        "of which processor's, where recorded",
+        "machine, where recorded",
+        "commits",
+    )
+    return markdown_table(heads, map(row, records))
+
+
+def _scale(record: Record) -> str:
+    heads = ("frames", "first batch after opening", "memory beyond the imports", "windows read per second")
+    rows = (
+        (
+            f"{size['frames']:,}",
+            f"{size['seconds']['first_batch']:.2f} s",
+            f"{size['megabytes_beyond_imports']:,} MB",
+            f"{size['windows_read_per_second']:,}",
+        )
+        for size in (record["small"], record["large"])
+    )
+    return markdown_table(heads, rows)
+
+
+# --- Which table a head is of ----------------------------------------------------------------------------------------
+
+KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of these records
+    r"task \| this policy \| spread": _beside_the_papers_model,
+    r"action rule": _action_rules,
+    r"task \| this policy \| best": _beside_the_optimum,
+    r"task \| 7.5 % causal": _causal_share,
+    r"sampled rollouts": _asked_rollouts,
+    r"return asked for": _asked_returns,
+    r"[\d,]+ histories": _backward,
+    r"K \| imitation": _both_questions,
+    r"model, K = 10": _ahead,
+    r"variant \| imitation": study_tables.summary_table,
+    r"numbers \| imitation": _encoding,
+    r"config \| mean return": _last_checkpoints,
+    r"frames \| first batch": _scale,
+    r"H \| carried out": study_tables.acting_table,
+    r"delay \| mask": study_tables.real_time_table,
+    r"model \| BC": study_tables.returns_table,
+    r"trained on, nats": study_tables.losses_table,
+    r"trained on, over": study_tables.normalised_table,
+    r"DoorKey: the paper's claim": claims.doorkey_claims,
+    r"Maze2D: the paper's claim": claims.maze2d_claims,
+    r"record \| runs": _hours,
+}
