@@ -24,7 +24,6 @@ from lerobot_unimask.data.factors import (
     Feature,
     check_layout,
     colour_cameras,
-    declared_feature,
     describe_features,
     group_features,
     is_numeric,
@@ -389,9 +388,8 @@ class UniMASKConfig(PreTrainedConfig):
         if not self.features:
             declared = {**(self.input_features or {}), **(self.output_features or {})}
             sizes = {key: feature for key, feature in declared.items() if len(feature.shape) <= 1}
-            self.features = group_features(
-                {key: declared_feature(key, feature) for key, feature in sizes.items()}, self.properties, self.states
-            )
+            found = {key: Feature(key, feature.shape[0] if feature.shape else 1) for key, feature in sizes.items()}
+            self.features = group_features(found, self.properties, self.states)
             pictures = {
                 key: {"dtype": "image", "shape": list(feature.shape), "names": ["channels", "height", "width"]}
                 for key, feature in declared.items()

@@ -5,8 +5,7 @@ import io
 import logging
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +22,7 @@ from lerobot_unimask.asking.given import Given
 from lerobot_unimask.asking.held_out import HeldOutActions
 from lerobot_unimask.asking.looking import observed_pictures
 from lerobot_unimask.asking.memory import RolloutMemory
-from lerobot_unimask.asking.predicting import predict
+from lerobot_unimask.asking.predicting import predict, without_dropout
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config, saved_factors
@@ -220,7 +219,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             ValueError: a shown token is neither recorded nor given, or a given value is not a legal one.
         """
         window, mask = pose_question(self, window, mask, t, given)
-        with _evaluation(self):
+        with without_dropout(self):
             return answer(self, window, mask)
 
     @torch.no_grad()
@@ -256,7 +255,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         window, mask = pose_question(self, window, mask, t, given)
         window, mask = window.repeat(check_count(samples)), mask.repeat(samples)
         generator = make_generator(seed, self.device)
-        with _evaluation(self):
+        with without_dropout(self):
             return sample(self, window, mask, order=order, generator=generator, check=check, tries=tries)
 
     # --- Acting ------------------------------------------------------------------------------------------------------
@@ -299,7 +298,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         if self._memory is None or len(self._memory.valid) != len(state):
             self._memory = new_memory(self, len(state))
         question = {"mask": mask, "given": given, "sample": sample, "generator": generator}
-        with _evaluation(self):
+        with without_dropout(self):
             pictures = observed_pictures(self, batch, len(state))
             return act(self, self._memory, state, so_far, pictures, batch.get(TASK), **question)
 
@@ -314,7 +313,7 @@ class UniMASKPolicy(PreTrainedPolicy):
         """A chunk for this observation, (B, H, D). Nothing is remembered, so that a server or a thread may call it at
         any time; for arguments see `asking.acting.plan_from`."""
         how = {"inference_delay": inference_delay, "left_over": prev_chunk_left_over, **kwargs}
-        with _evaluation(self):
+        with without_dropout(self):
             state = observed_state(self, batch)
             return plan_from(self, state, observed_pictures(self, batch, len(state)), batch.get(TASK), **how)
 
@@ -435,16 +434,3 @@ class UniMASKPolicy(PreTrainedPolicy):
         check_weights(weights, model.state_dict(), model_file)
         model.load_state_dict(weights)
         return model
-
-
-@contextmanager
-def _evaluation(policy: UniMASKPolicy) -> Iterator[None]:
-    """Answers are given without dropout, also while the policy is being trained."""
-    was_training = policy.training
-    if was_training:  # each change of mode walks through all modules
-        policy.eval()
-    try:
-        yield
-    finally:
-        if was_training:
-            policy.train()

@@ -1,5 +1,7 @@
 """From a question to the network's outputs: which way a window is read follows from what is asked."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import torch
@@ -19,6 +21,19 @@ class Learnt(Protocol):
     config: UniMASKConfig
     training_masks: TrainingMasks
     network: nn.Module
+
+
+@contextmanager
+def without_dropout(model: nn.Module) -> Iterator[None]:
+    """Answers are given in evaluation mode, also while the model is being trained."""
+    was_training = model.training
+    if was_training:  # each change of mode walks through all modules
+        model.eval()
+    try:
+        yield
+    finally:
+        if was_training:
+            model.train()
 
 
 def predict(model: Learnt, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from lerobot.configs import PolicyFeature
 from lerobot.utils.constants import OBS_PREFIX
 from torch import Tensor
 
@@ -269,10 +268,6 @@ def check_layout(entries: Mapping[str, Mapping[str, Any]]) -> None:
                 key,
                 key,
             )
-
-
-def declared_feature(key: str, feature: PolicyFeature) -> Feature:
-    return Feature(key, feature.shape[0] if feature.shape else 1)
 
 
 def category_numbers(texts: str | Sequence[str], factor: Factor) -> list[list[float]]:
