@@ -438,7 +438,9 @@ def read_config(folder: Path) -> UniMASKConfig:
 
 def saved_factors(config: UniMASKConfig, folder: Path) -> dict[str, Factor]:
     """The factors as a checkpoint's own heads predict them: the config that it is read with may say joint where it has
-    separate ones."""
-    saved = copy(config)
-    saved.discrete_head = read_config(folder).discrete_head
+    separate ones, or a mixture where it has Gaussians."""
+    saved, own = copy(config), read_config(folder)
+    saved.discrete_head = own.discrete_head
+    if (own.continuous_head, config.continuous_head) == ("gaussian", "mixture"):
+        saved.continuous_head = "gaussian"
     return saved.make_factors()

@@ -299,6 +299,26 @@ def test_separate_heads_go_on_as_joint_ones_that_answer_the_same(network, tiny_p
     assert_same_answers(loaded.infer(window, mask), policy.infer(window, mask), exactly=False)
 
 
+@pytest.mark.parametrize("network", ["transformer", "feedforward"])
+def test_gaussians_go_on_as_a_mixture_whose_parts_begin_at_their_means(network, tiny_policy, batch_of, tmp_path):
+    """The widest as wide as they are, no two the same."""
+    policy = tiny_policy("gaussian", network=network)
+    policy.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.continuous_head, config.mixture_components = "mixture", 3
+    loaded = UniMASKPolicy.from_pretrained(tmp_path, config=config).eval()
+    window, mask = random_question(policy, batch_of("gaussian"), 0)
+    before, after = policy.infer(window, mask), loaded.infer(window, mask)
+    for name in "sa":
+        (mixture,) = after.distributions[name]
+        asked = mask.asked[name]
+        one = torch.cat([part.means[asked][:, 0] for part in before[name]], dim=-1)  # (M, D)
+        wide = torch.cat([part.scales[asked][:, 0] for part in before[name]], dim=-1)
+        torch.testing.assert_close(mixture.means[asked], one.unsqueeze(1).expand(-1, 3, -1))
+        torch.testing.assert_close(mixture.scales[asked][:, 0], wide)
+        assert (mixture.scales[asked].diff(dim=1) < 0).all()
+
+
 def test_another_kind_of_policy_is_named(tmp_path):
     (tmp_path / "config.json").write_text('{"type": "act"}')
     with pytest.raises(ValueError, match="type 'act'"):

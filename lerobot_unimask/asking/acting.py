@@ -34,14 +34,17 @@ from lerobot_unimask.data.returns import EpisodeStarts
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask, MaskTable, Token, tabulate
+from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.networks.layers import Cache
 
 logger = logging.getLogger(__name__)
 
 
 class ActingModel(Model, LookingModel, Protocol):
-    """A model with its config and what it keeps of its training episodes."""
+    """A model with its config, what it was trained on, and what it keeps of its training episodes."""
 
     config: UniMASKConfig
+    training_masks: TrainingMasks
     episode_starts: EpisodeStarts
 
     def make_window(self, batch: Mapping[str, Any], *, partial: bool = False) -> Window:
@@ -73,8 +76,8 @@ def act(
     memory.task = task
     memory.observe(state, return_so_far, pictures)
     if not memory.planned:
-        actions = plan(model, memory, **question)
-        memory.planned = list(actions[:, : model.config.n_action_steps].unbind(1))
+        actions = plan(model, memory, model.config.n_action_steps, **question)
+        memory.planned = list(actions.unbind(1))
     action = memory.planned.pop(0)
     memory.act(action)
     return as_action(model, action)
@@ -115,7 +118,7 @@ def plan_from(
     memory.task = task
     memory.observe(state, torch.zeros(len(state), device=model.device), pictures)
     prefix = _on_their_way(model, inference_delay, left_over)
-    return as_action(model, plan(model, memory, prefix=prefix, **question))
+    return as_action(model, plan(model, memory, model.config.chunk_size, prefix=prefix, **question))
 
 
 def _on_their_way(model: ActingModel, inference_delay: int, left_over: Tensor | None) -> Tensor | None:
@@ -137,6 +140,7 @@ def _on_their_way(model: ActingModel, inference_delay: int, left_over: Tensor | 
 def plan(
     model: ActingModel,
     memory: RolloutMemory,
+    size: int,
     *,
     mask: str | None = None,
     given: Given | None = None,
@@ -144,7 +148,11 @@ def plan(
     generator: torch.Generator | None = None,
     prefix: Tensor | None = None,
 ) -> Tensor:
-    """The chunk of actions from the present on, (B, H, D), in the dataset's units.
+    """The next `size` actions from the present on, (B, size, D), in the dataset's units.
+
+    Where the model answers the present action causally, and has learnt what comes after it so too, the actions
+    are answered one after another, each given the actions and states before it, those of the chunk as they were
+    answered: so each is what acting would answer there if all went as the model expects. Else all are answered at once.
 
     Args:
         prefix: (B, d, D) actions that are on their way already: shown, and returned as they are.
@@ -176,16 +184,62 @@ def plan(
         if token.of_episode and (token.factor, position) in here:
             question.shown[token.factor][:, position] = True
             question.asked[token.factor][:, position] = False
-    _ask_chunk(question, window, known, present, config.chunk_size, prefix)
+    _ask_chunk(question, window, known, present, size, prefix)
     check_known(question, known, text)
     question = question.to(model.device)
-    if (config.sample_actions if sample is None else sample) and config.chunk_size > 1:
+    drawn = config.sample_actions if sample is None else sample
+    if size > 1 and _follow_on(model, question, present, size):
+        values = _one_by_one(model, window, question, present, size, memory.cache, drawn, generator)
+    elif size > 1 and drawn:
         values = draw_jointly(model, window, question, order="forward", generator=generator).values["a"]
     else:
         said = answer(model, window, question, memory.cache)
-        drawn = config.sample_actions if sample is None else sample
         values = said.draw("a", generator) if drawn else said.most_likely("a")
-    return values[:, present : present + config.chunk_size]
+    return values[:, present : present + size]
+
+
+def _history(question: Mask, present: int, step: int, name: str) -> Mask:
+    """The question about the state or the action of a step at or after the present, given all states and actions before
+    it and what the question shows of properties and pictures."""
+    steps = torch.arange(question.shown["s"].shape[1], device=question.shown["s"].device)
+    shown = dict(question.shown)
+    shown["s"] = question.shown["s"] | ((steps > present) & (steps < step + (name == "a")))
+    shown["a"] = (question.shown["a"] & (steps < present)) | ((steps >= present) & (steps < step))
+    asked = {other: torch.zeros_like(tokens) for other, tokens in shown.items()}
+    asked[name][:, step] = True
+    return Mask(shown, asked)
+
+
+def _follow_on(model: ActingModel, question: Mask, present: int, size: int) -> bool:
+    """Whether the model has learnt to answer the actions of a chunk, and the states between them, causally."""
+    if question.shown["s"][:, present + 1 :].any() or question.shown["a"][:, present + size :].any():
+        return False
+    learnt = model.training_masks.answered_causally
+    state = learnt(_history(question, present, present + 1, "s"))["s"]
+    action = learnt(_history(question, present, present + size - 1, "a"))["a"]
+    return bool(state.any(1).all() and action.any(1).all())
+
+
+def _one_by_one(
+    model: ActingModel,
+    window: Window,
+    question: Mask,
+    present: int,
+    size: int,
+    cache: Cache,
+    drawn: bool,
+    generator: torch.Generator | None,
+) -> Tensor:
+    """The window's actions, (B, K, D), with those of the chunk: answered in the order of time, each given the states
+    and actions before it as they are observed, on their way or answered."""
+    values = {name: value.clone() for name, value in window.values.items()}
+    rows = torch.arange(len(window.valid), device=window.valid.device)
+    for step in range(present, present + size):
+        for name in "sa":
+            if not question.shown[name][0, step]:
+                said = answer(model, Window(values, window.valid), _history(question, present, step, name), cache)
+                values[name][:, step] = said.at(name, rows, step, drawn=drawn, generator=generator)
+    return values["a"]
 
 
 def _ask_chunk(

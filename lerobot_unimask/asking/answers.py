@@ -212,10 +212,13 @@ class Answer:
         """(B, K, D): one sample for each step."""
         return self._tokens(factor, [distribution.draw(generator) for distribution in self.distributions[factor]])
 
-    def draw_at(self, factor: str, rows: Tensor, step: int, generator: torch.Generator | None) -> Tensor:
-        """One sample for one step of some windows, (n,) their numbers: (n, D)."""
+    def at(
+        self, factor: str, rows: Tensor, step: int, *, drawn: bool, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """One step of some windows, (n,) their numbers: (n, D), a sample or what is most likely."""
         here = [distribution.at(rows, step) for distribution in self.distributions[factor]]
-        return self._tokens(factor, [distribution.draw(generator) for distribution in here])[:, 0]
+        parts = [distribution.draw(generator) if drawn else distribution.most_likely for distribution in here]
+        return self._tokens(factor, parts)[:, 0]
 
     def _tokens(self, factor: str, parts: list[Tensor]) -> Tensor:
         """The outputs' values, (B, K, d) each, as tokens, (B, K, D)."""

@@ -106,7 +106,7 @@ def sample(
             shown = shown | {name: shown[name] | here}
             redraw = here[:, step].nonzero().squeeze(-1)
             for _ in range(tries):
-                values[name][redraw, step] = said.draw_at(name, redraw, step, generator)
+                values[name][redraw, step] = said.at(name, redraw, step, drawn=True, generator=generator)
                 samples.drawn += len(redraw)
                 redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(shown, redraw))]
                 samples.rejected += len(redraw)

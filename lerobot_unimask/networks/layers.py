@@ -5,7 +5,7 @@ Legend of shapes: B windows, K steps, N tokens, D the numbers of a factor, W wid
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -204,27 +204,42 @@ def marginals(prediction: Tensor, output: Output) -> list[Tensor]:
 
 
 def joined(
-    weights: Mapping[str, Tensor], separate: Mapping[str, Factor], joint: Mapping[str, Factor]
+    weights: Mapping[str, Tensor], saved: Mapping[str, Factor], wanted: Mapping[str, Factor]
 ) -> dict[str, Tensor]:
-    """A checkpoint's weights of separate heads as those of joint ones, which at first answer the same: the logit of a
-    combination is the sum of its categories'. Of heads that are joint already, nothing."""
+    """A checkpoint's heads as those that training goes on with. Separate heads become joint ones, which at first answer
+    the same: the logit of a combination is the sum of its categories'. Gaussians become a mixture whose parts begin at
+    their means, each with another scale, so that the parts can come to differ. Of heads that are as wanted, nothing."""
     heads: dict[str, Tensor] = {}
     for key, rows in weights.items():
         found = re.fullmatch(r"network\.heads\.(\w+)\.(weight|bias)", key)
-        if found is None or separate == joint:
+        if found is None or saved == wanted:
             continue
-        outputs = separate[found[1]].outputs
+        outputs = saved[found[1]].outputs
         sizes = [output.size for output in outputs]
         parts = rows.unflatten(0, (-1, sum(sizes))).split(sizes, dim=1)  # (steps, size, ...) each
         of_number = {output.numbers[0]: part for output, part in zip(outputs, parts, strict=True)}
         whole = []
-        for output in joint[found[1]].outputs:
+        for output in wanted[found[1]].outputs:
             total, *others = (of_number[number] for number in output.numbers if number in of_number)
-            for other in others:
-                total = (total.unsqueeze(2) + other.unsqueeze(1)).flatten(1, 2)
+            if output.gaussians > 1 and outputs[-1].gaussians == 1:
+                total = _begin_mixture([total, *others], output.gaussians, bias=found[2] == "bias")
+            else:
+                for other in others:
+                    total = (total.unsqueeze(2) + other.unsqueeze(1)).flatten(1, 2)
             whole.append(total)
         heads[key] = torch.cat(whole, dim=1).flatten(0, 1)
     return heads
+
+
+def _begin_mixture(gaussians: Sequence[Tensor], count: int, *, bias: bool) -> Tensor:
+    """The rows of a head that predicts `count` Gaussians, from those of one for each component, (steps, 2 d, ...)."""
+    means, scales = (torch.cat(part, dim=1) for part in zip(*(rows.chunk(2, dim=1) for rows in gaussians), strict=True))
+    factors = (
+        torch.arange(count, device=means.device) / 2 * bias
+    )  # logarithms: each part is narrower than the one before
+    scales = torch.cat([scales - factor for factor in factors], dim=1)
+    logits = torch.zeros_like(means[:, :1]).repeat_interleave(count, dim=1)
+    return torch.cat([logits, torch.cat([means] * count, dim=1), scales], dim=1)
 
 
 @dataclass

@@ -122,7 +122,7 @@ def _ask(policy: UniMASKPolicy, states: np.ndarray, delay: int, left: Tensor | N
     """(B, H, D), as `predict_action_chunk` answers, whose left-over is one robot's: here each mass has its own."""
     memory = new_memory(policy, len(states))
     memory.observe(torch.from_numpy(states), None)
-    return plan(policy, memory, prefix=None if left is None else left[:, :delay])
+    return plan(policy, memory, policy.config.chunk_size, prefix=None if left is None else left[:, :delay])
 
 
 @contextmanager
