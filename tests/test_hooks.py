@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from policies import CONTINUOUS_STATS, TRAIN_FLAGS
+from policies import CONTINUOUS_STATS
 from torch import nn
 
 from lerobot_unimask.envs.configs import GymnasiumEnvConfig
@@ -40,24 +40,6 @@ def test_a_windows_part_is_its_own(tiny_policy, doorkey_batch):
 def test_another_reduction_is_refused(tiny_policy, doorkey_batch):
     with pytest.raises(ValueError, match=r"sum.*mean or none"):
         tiny_policy().forward(doorkey_batch, reduction="sum")
-
-
-def test_lerobot_train_weights_samples(doorkey_root, tmp_path):
-    log = commands.check(
-        "lerobot-train",
-        *TRAIN_FLAGS,
-        "--dataset.repo_id=local/doorkey",
-        f"--dataset.root={doorkey_root}",
-        "--sample_weighting.type=uniform",
-        "--steps=2",
-        "--batch_size=4",
-        "--log_freq=1",
-        "--num_workers=0",
-        "--env_eval_freq=0",
-        "--output_dir=run",
-        cwd=tmp_path,
-    )
-    assert "End of training" in log
 
 
 @pytest.mark.parametrize("network", ["transformer", "feedforward", "decision_transformer"])

@@ -30,10 +30,12 @@ def in_process(script: str, *arguments: str, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture(scope="module")
 def trained(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A run of the real command with LeRobot's own defaults for workers and asynchronous environments."""
+    """A run of the real command with LeRobot's own defaults for workers and asynchronous environments, its windows
+    weighted, for which LeRobot asks for the loss of each."""
     folder = tmp_path_factory.mktemp("train")
     flags = ["--steps=4", "--batch_size=8", "--dataset.eval_split=0.25", "--eval_steps=2", "--save_freq=2"]
     flags += ["--log_freq=1", "--env.type=doorkey", "--env_eval_freq=4", "--eval.n_episodes=3", "--eval.batch_size=3"]
+    flags += ["--sample_weighting.type=uniform"]
     log = commands.check(
         "lerobot-train", *TRAIN_FLAGS, *data, *flags, "--num_workers=1", "--output_dir=run", cwd=folder
     )

@@ -276,29 +276,3 @@ def test_blocks_and_commands_are_found_with_their_lines() -> None:
     assert install.reason_not_to_run == "installs"
     assert build.reason_not_to_run is None
     assert train.reason_not_to_run == "takes hours"
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("unimask build doorkey --episodes=500 --root=d", "unimask build doorkey --root=d --episodes=40"),
-        ("unimask build doorkey --root=d", "unimask build doorkey --root=d"),
-        ("unimask measure --dataset.episodes=900:1000", "unimask measure --dataset.episodes=36:40"),
-        (
-            "lerobot-eval --policy.path=o/checkpoints/004000/pretrained_model --eval.n_episodes=100",
-            "lerobot-eval --policy.path=o/checkpoints/last/pretrained_model --eval.n_episodes=1 --eval.batch_size=1",
-        ),
-    ],
-)
-def test_only_what_makes_it_long_is_changed(line: str, expected: str) -> None:
-    assert " ".join(shortened(line.split())) == expected
-
-
-def test_training_is_shortened_by_what_it_starts_from() -> None:
-    fresh = shortened(["lerobot-train", "--policy.type=unimask", "--steps=4000", "--eval_steps=500"])
-    assert {"--steps=4", "--policy.width=16", "--eval_steps=2", "--num_workers=0"} <= set(fresh)
-    assert not {"--steps=4000", "--eval_steps=500"} & set(fresh)
-    tuned = shortened(["lerobot-train", "--policy.path=o/checkpoints/last/pretrained_model"])
-    assert not [word for word in tuned if "width" in word]
-    resumed = shortened(["lerobot-train", "--config_path=o/train_config.json", "--resume=true"])
-    assert "--steps=6" in resumed
