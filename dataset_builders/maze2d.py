@@ -31,7 +31,7 @@ def collect_episodes(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Run the expert for whole episodes; N = 200 episodes, frames in order.
 
-    Episode i depends on (seed, i, maze, noise) alone, and its start and goal not on the noise.
+    Episode i depends only on (seed, i, maze, noise), and its start and goal not on the noise.
 
     Returns:
         The columns (N, ...) `observation.state`, `action` (as the environment received it), `next.reward` and

@@ -139,7 +139,7 @@ class UniMASKConfig(PreTrainedConfig):
     attention: str | None = None
     """How a window is read. "both": training windows are read causally or in both directions, and so are questions:
     causally where they ask for the next token given all before it, as acting does. "bidirectional" is the paper's,
-    "causal" acts alone. None: the network's own way, which is "both" for the transformer."""
+    "causal" only acts. None: the network's own way, which is "both" for the transformer."""
     causal_share: float = 0.5
     """Share of the training windows that are read causally, with attention=both."""
     token_layout: str = "separate"
@@ -226,7 +226,7 @@ class UniMASKConfig(PreTrainedConfig):
     """Format of a checkpoint's files."""
 
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=UNCHANGED.copy)
-    """LeRobot's processors leave the numbers alone: the policy normalises, with statistics that it keeps itself."""
+    """LeRobot's processors leave the numbers as they are: the policy normalises, with statistics that it keeps itself."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -288,7 +288,7 @@ class UniMASKConfig(PreTrainedConfig):
                 raise ValueError(f"loss_weights names {name}; only {' and '.join(ASKABLE)} are predicted.")
             if not 0 <= weight < float("inf"):
                 raise ValueError(f"loss_weights gives {name} the weight {weight}; weights are numbers from 0 on.")
-        # Syntax alone: which factors exist is known once the dataset or the checkpoint has been read.
+        # Just the syntax: which factors exist is known once the dataset or the checkpoint has been read.
         for text in mixture(self.training_masks):
             if text != RANDOM_MASK:
                 parse(text)
@@ -329,7 +329,7 @@ class UniMASKConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, dataset_features: dict[str, dict[str, Any]]) -> None:
-        """Read the factors off a dataset's features; LeRobot calls this in training alone.
+        """Read the factors off a dataset's features; LeRobot calls this only in training.
 
         Raises:
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.

@@ -40,7 +40,7 @@ STEPS = 3000
 
 ROLLOUTS = 200
 
-# Random masks alone would do, with more updates: they hit the questions of acting rarely.
+# Just random masks would do, with more updates: they hit the questions of acting rarely.
 MASKS = {"random_mask": 3, "goal_conditioned": 1, "reward_conditioned": 1}
 
 COMMANDS = {"lerobot-train": lerobot_train.main, "lerobot-eval": lerobot_eval.main}

@@ -166,7 +166,7 @@ def _record_integers() -> None:
 
 
 def make_known_to_policy_server() -> None:
-    """LeRobot's policy server refuses policies that are not in a list of its own; `unimask serve` alone calls this.
+    """LeRobot's policy server refuses policies that are not in a list of its own; only `unimask serve` calls this.
 
     Other policies: unchanged.
     """

@@ -1,7 +1,7 @@
 """LeRobot's processors for `unimask`: naming, batching and devices.
 
 The steps are LeRobot's own, with its own names, because lerobot-train overrides them by name. The normalisation mapping
-is the identity throughout: the policy alone normalises, so that everything outside it is in the dataset's units.
+is the identity throughout: only the policy normalises, so that everything outside it is in the dataset's units.
 """
 
 from typing import Any

@@ -184,7 +184,7 @@ def make_factors(
     Args:
         joint: predict a token's discrete components as one distribution, where it is over at most `MAX_JOINT`
             combinations; otherwise each by itself.
-        gaussians: number of Gaussians that continuous components are predicted as: 0, a mean alone; 1, a mean and a
+        gaussians: number of Gaussians that continuous components are predicted as: 0, just a mean; 1, a mean and a
             scale for each number; more, a mixture over all of a token's continuous numbers.
     """
     factors = {}

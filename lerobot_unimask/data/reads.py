@@ -95,7 +95,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of a dataset, as stored. In memory are their booleans alone, and what tells where the rest is."""
+    """The columns of a dataset, as stored. Only their booleans are in memory, and what tells where the rest is."""
 
     columns: dict[str, Column]  # in the order of an item's keys
     pieces: np.ndarray  # (P,): the rows up to the end of each piece, the same in all columns
@@ -118,7 +118,7 @@ def _flat_numbers(array: pa.Array) -> np.ndarray | None:
         elif pa.types.is_nested(array.type):
             array = array.flatten()
         else:
-            return array.to_numpy(zero_copy_only=False)  # copies booleans alone, which Arrow packs in bits
+            return array.to_numpy(zero_copy_only=False)  # copies only booleans, which Arrow packs in bits
     return None
 
 

@@ -57,7 +57,7 @@ class EpisodeStarts(nn.Module):
         self.states, self.returns = states.to(self.states), returns.to(self.returns)
 
     def make_room(self, episodes: int) -> None:
-        """For a checkpoint's episodes, whose number the weights alone tell."""
+        """Get room for as many episodes as a checkpoint holds."""
         self.fill(self.states.new_zeros(episodes, self.states.shape[1]), self.returns.new_zeros(episodes))
 
     def nearest_return(self, state: Tensor) -> Tensor:

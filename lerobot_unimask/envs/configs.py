@@ -101,7 +101,7 @@ class Maze2DEnvConfig(UniMASKEnvConfig):
     obs_type: str = "state"
     """What is observed: "state", or "pixels_agent_pos", a picture too."""
     hide_goal: bool = False
-    """Whether the state is the position alone, so that the goal is to be seen in the picture only."""
+    """Whether the state is the position without the goal, which is then to be seen in the picture only."""
 
     def __post_init__(self) -> None:
         if self.hide_goal:

@@ -92,7 +92,7 @@ def commit_of(folder: Path) -> str | None:
 
 
 def _damaged(path: Path) -> bool:
-    """The client checks a download's length alone. Its cache names each file by its hash: sha256, or git's sha1."""
+    """The client checks only a download's length. Its cache names each file by its hash: sha256, or git's sha1."""
     blob = path.resolve()
     digest = {40: hashlib.sha1, 64: hashlib.sha256}.get(len(blob.name))
     if digest is None or not re.fullmatch("[0-9a-f]+", blob.name):  # no cache of hashes, as on a disk without links
@@ -106,7 +106,7 @@ def _check_processors(folder: Path, repo_id: str) -> None:
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         steps = json.loads((folder / name).read_text())["steps"] if (folder / name).exists() else []
         if any("registry_name" not in step for step in steps):
-            raise HubError(f"{name} of {repo_id} names code to run; a unimask policy's steps are LeRobot's own alone.")
+            raise HubError(f"{name} of {repo_id} names code to run; a unimask policy has only LeRobot's own steps.")
 
 
 @contextmanager
@@ -244,12 +244,12 @@ def _push(
     again: str,
     tag: str | None = None,
 ) -> str:
-    """Make one commit of all files; with a tag, of these files alone, and let the tag name it."""
+    """Make one commit of all files; with a tag, which then names it, the repository holds no others."""
     api = HfApi()
     with _push_errors(repo_id, again, "nothing of this push is to be seen there"):
         url = api.create_repo(repo_id, repo_type=kind, private=private, exist_ok=True)
         repo_id = url.repo_id
-        # The client leaves out what the head has already, so the commit is whole on this head alone.
+        # The client leaves out what the head has already, so the commit is whole only on this head.
         head = api.repo_info(repo_id, repo_type=kind).sha
         operations: list[Any] = [CommitOperationAdd(path, content) for path, content in files.items()]
         if tag is not None:

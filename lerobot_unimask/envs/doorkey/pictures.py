@@ -73,7 +73,7 @@ def draw_panels(panels: Sequence[Panel]) -> Figure:
 
     Under each panel's name stands its question, below the grid what came of it. Colour and arrows show time; the
     jitter only keeps trajectories apart that share cells. Drawn are the window's states: a rollout's last action, after
-    s[K-1], counts in its return alone. A panel without trajectories has its grid alone.
+    s[K-1], counts only in its return. A panel without trajectories has just its grid.
     """
     figure = Figure(figsize=(WIDTH, 2.72), layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -97,7 +97,7 @@ class DynamicsCheck:
     Args:
         agree: insist, too, that all decided tokens agree, however far apart: that one whole episode has them all. This
             is the rejection that the paper leaves undone, of what contradicts a state shown elsewhere. Without it each
-            step is judged alone, from what is decided of its two states and its action.
+            step is judged by itself, from what is decided of its two states and its action.
         first_step: the episode's step at which the windows start; `agree` knows which states it can have.
     """
 
