@@ -226,7 +226,7 @@ class UniMASKConfig(PreTrainedConfig):
     """Format of a checkpoint's files."""
 
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=UNCHANGED.copy)
-    """LeRobot's processors leave the numbers as they are: the policy normalises, with statistics that it keeps itself."""
+    """LeRobot's processors change no number: the policy normalises, with statistics that it keeps itself."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
