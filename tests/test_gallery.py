@@ -34,12 +34,13 @@ def test_every_picture_of_a_doorkey_policy_is_small(tiny_policy, doorkey, doorke
     assert all(file.stat().st_size < LARGEST for file in files)
 
 
-def test_a_maze_policy_has_its_picture(tiny_policy):
+def test_a_maze_policy_has_its_pictures(tiny_policy):
     policy = tiny_policy("gaussian", features=MAZE, stats=MAZE_STATS)
     states = torch.tensor([[1.0 + 0.1 * step, 1.0, 3.0, 2.0] for step in range(10)]).repeat(3, 1, 1)
     batch = {"observation.state": states, "action": torch.zeros(3, 10, 2)}
-    (picture,) = maze_pictures(policy, batch)
-    assert picture.name == "maze2d"
+    picture, starts = maze_pictures(policy, batch, states[:, 0])
+    assert (picture.name, starts.name) == ("maze2d", "maze2d_starts")
+    assert sum(line.get_marker() == "*" for line in starts.figure.axes[0].lines) == len(states)
     assert "s[:] | s[0], s[5]" in picture.text
 
 

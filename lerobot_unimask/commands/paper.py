@@ -182,6 +182,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
     from itertools import chain
 
     from lerobot_unimask.data.episodes import first_windows, middle_windows, open_dataset, provenance_of
+    from lerobot_unimask.data.factors import STATE
     from lerobot_unimask.envs.maze2d.record import maze_of
     from lerobot_unimask.modeling_unimask import UniMASKPolicy
     from lerobot_unimask.paper.gallery import doorkey_pictures, maze_pictures, write_gallery
@@ -192,8 +193,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
     if arguments.maze_path is not None:
         maze = UniMASKPolicy.from_pretrained(arguments.maze_path)
         dataset = open_dataset(maze.config, arguments.maze_root)
-        pictures = chain(
-            pictures, maze_pictures(maze, middle_windows(dataset), walls=maze_of(provenance_of(Path(dataset.root))))
-        )
+        starts, walls = first_windows(dataset)[STATE][:, 0], maze_of(provenance_of(Path(dataset.root)))
+        pictures = chain(pictures, maze_pictures(maze, middle_windows(dataset), starts, walls=walls))
     for path in write_gallery(pictures, arguments.output, command=arguments.text):
         print(path)

@@ -21,7 +21,7 @@ from lerobot_unimask.envs.doorkey.panels import (
 )
 from lerobot_unimask.envs.doorkey.pictures import draw_panels, state_distributions, trajectories
 from lerobot_unimask.envs.doorkey.rules import GOAL, START_PAIRS, DynamicsCheck
-from lerobot_unimask.envs.maze2d.pictures import maze_trajectories
+from lerobot_unimask.envs.maze2d.pictures import draw_ways, maze_trajectories
 from lerobot_unimask.language.masks import tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.paper.questions import CORNER, IMITATION, PROPERTY, PROPERTY_QUESTION, rollout
@@ -134,11 +134,14 @@ def _property(policy: UniMASKPolicy) -> Picture:
     return Picture("property", "A property", text, figure)
 
 
-def maze_pictures(policy: UniMASKPolicy, batch: dict[str, torch.Tensor], *, walls: str = "medium") -> Iterator[Picture]:
-    """The pictures of a Maze2D policy: the way through a window, its ends and middle shown.
+def maze_pictures(
+    policy: UniMASKPolicy, batch: dict[str, torch.Tensor], starts: torch.Tensor, *, walls: str = "medium"
+) -> Iterator[Picture]:
+    """The pictures of a Maze2D policy: the way through a window, its ends and middle shown; and where episodes begin.
 
     Args:
         batch: recorded windows, of which the one with the longest way is drawn.
+        starts: (E, 4), the episodes' first states, of which nine are drawn.
         walls: the maze's name or text.
     """
     way = (batch[STATE][:, -1, :2] - batch[STATE][:, 0, :2]).norm(dim=-1)
@@ -152,6 +155,8 @@ def maze_pictures(policy: UniMASKPolicy, batch: dict[str, torch.Tensor], *, wall
         f"`{text}`, a recorded episode: the mass's position, shown twice; what lies between and what follows is asked.",
         maze_trajectories(policy.infer(window, text), window, maze=walls),
     )
+    text = "Where nine recorded episodes begin and where they are sent: the paper's figure of initialisations."
+    yield Picture("maze2d_starts", "Maze2D's starts", text, draw_ways(starts[:9, None].numpy(force=True), walls))
 
 
 def write_gallery(pictures: Iterator[Picture], output: Path, *, command: str) -> list[Path]:
