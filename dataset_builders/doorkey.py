@@ -55,6 +55,7 @@ def build_doorkey(
     repo_id: str | None = None,
     beta: float = 1.0,
     camera: bool = False,
+    use_videos: bool = True,
     progress: bool = True,
 ) -> Path:
     """Roll out the expert and write a LeRobotDataset.
@@ -69,6 +70,7 @@ def build_doorkey(
         repo_id: name of the dataset, `ME/NAME`; `local/doorkey` if None.
         beta: rationality of the expert.
         camera: whether there is `observation.images.top`, a video of the grid as MiniGrid draws it.
+        use_videos: whether it is a video; else pictures in the table.
         progress: whether to show progress bars, on a terminal.
 
     Returns:
@@ -98,7 +100,7 @@ def build_doorkey(
         root,
         repo_id=repo_id or "local/doorkey",
         fps=FPS,
-        features=FEATURES | ({CAMERA: camera_feature(*CAMERA_SHAPE[:2])} if camera else {}),
+        features=FEATURES | ({CAMERA: camera_feature(*CAMERA_SHAPE[:2], use_videos=use_videos)} if camera else {}),
         columns=columns,
         lengths=np.full(episodes, HORIZON),
         task=TASK,

@@ -74,6 +74,7 @@ def build_maze2d(
     maze: str = "medium",
     repo_id: str | None = None,
     camera: bool = False,
+    use_videos: bool = True,
     hide_goal: bool = False,
     progress: bool = True,
 ) -> Path:
@@ -89,6 +90,7 @@ def build_maze2d(
         maze: name or text of the maze, see `parse_maze`.
         repo_id: name of the dataset, `ME/NAME`; `local/maze2d` if None.
         camera: whether there is `observation.images.top`, a video of the maze, the goal and the mass from above.
+        use_videos: whether it is a video; else pictures in the table.
         hide_goal: whether the state is x and y, without the goal.
         progress: whether to show progress bars, on a terminal.
 
@@ -108,7 +110,8 @@ def build_maze2d(
     lengths = np.full(episodes, HORIZON)
     states, features, pictures = columns["observation.state"], dict(FEATURES), {}
     if camera:
-        features[CAMERA] = camera_feature(*camera_picture(parse_maze(maze), (1, 1), (1, 1)).shape[:2])
+        height, width, _ = camera_picture(parse_maze(maze), (1, 1), (1, 1)).shape
+        features[CAMERA] = camera_feature(height, width, use_videos=use_videos)
         pictures[CAMERA] = _pictures(maze, states)
     if hide_goal:
         features["observation.state"] = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}

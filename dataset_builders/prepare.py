@@ -17,13 +17,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from dataset_builders.folders import refuse_existing, written_whole
 from dataset_builders.label import copy_rest, data_files, episode_files, rewrite
 from dataset_builders.writer import dataset_statistics, episode_statistics
 from lerobot_unimask.data.episodes import check_folder
-from lerobot_unimask.data.factors import flat_names
+from lerobot_unimask.data.factors import TEXTS, flat_names
+from lerobot_unimask.data.soundness import check_columns, check_statistics
 from lerobot_unimask.records import read_json, write_json
 
 PICTURES = ("image", "video")
@@ -93,15 +94,17 @@ def make_plan(
         have = wanted in features or (wanted == OBS_STATE and OBS_ENV_STATE in features)
         if not have and wanted not in asked.values() and found:
             asked[found[0]] = wanted
+    plan.drop = [name for name in drop if name != "missing"]
+    absent = [] if plan.convert else cameras_without_files(root, features)
+    for key, entry in features.items():
+        seen = key.startswith(OBS_PREFIX) or key in (*asked, *plan.drop, *absent)
+        if entry["dtype"] in PICTURES and not seen:
+            asked[key] = f"{OBS_IMAGES}.{key}"
     for old, new in asked.items():
         if new in features:
             raise ValueError(f"{root} has a column {new!r} already, so {old!r} cannot be called so.")
-        if features[old]["dtype"] == "video":
-            raise ValueError(f"{old} is a video, whose files bear its name: it cannot be renamed here.")
         plan.rename[old] = new
         plan.why.append(f"--rename {old}={new}: LeRobot's policies read columns of that name.")
-    absent = [] if plan.convert else cameras_without_files(root, features)
-    plan.drop = [name for name in drop if name != "missing"]
     for key in absent:
         if key not in plan.drop:
             plan.drop.append(key)
@@ -109,7 +112,7 @@ def make_plan(
     stats = read_json(root / "meta" / "stats.json") if (root / "meta" / "stats.json").exists() else {}
     for old, entry in features.items():
         new = plan.rename.get(old, old)
-        if old in plan.drop or entry["dtype"] in (*PICTURES, "string", "language"):
+        if old in plan.drop or entry["dtype"] in (*PICTURES, *TEXTS):
             continue
         if len(entry["shape"]) > 1:
             plan.flatten.append(old)
@@ -121,14 +124,34 @@ def make_plan(
         whole = entry["dtype"].startswith(("int", "uint")) and "categories" not in entry
         if new == ACTION and whole and new not in (categories or {}) and old not in (categories or {}):
             plan.why.append(f"(not done) {new} holds whole numbers: if they are choices, --categories {new}=auto.")
-        missing = {"mean", "std"} - stats.get(old, {}).keys()
-        if (missing and not plan.convert) or old in plan.flatten:
+        fault = (
+            None
+            if plan.convert or old in plan.flatten
+            else _fault(stats.get(old, {}), int(np.prod(entry["shape"])), _is_read(new))
+        )
+        if fault or old in plan.flatten:
             plan.statistics.append(new)
-            plan.why.append(f"statistics of {new}: meta/stats.json lacks them.")
+            plan.why.append(f"statistics of {new}: {fault or 'those in meta/stats.json have its old shape'}.")
     for key, count in (categories or {}).items():
         plan.categories[plan.rename.get(key, key)] = count if count == AUTO else int(count)
         plan.why.append(f"--categories {key}={count}.")
     return plan
+
+
+def _fault(known: Mapping[str, Any], size: int, is_read: bool) -> str | None:
+    """What is wrong with a column's statistics."""
+    if not {"mean", "std"} <= known.keys():
+        return "meta/stats.json lacks them"
+    try:
+        check_statistics("it", [""] * size, known)
+    except ValueError:
+        return "those in meta/stats.json are not sound" if is_read else None
+    return None
+
+
+def _is_read(key: str) -> bool:
+    """Whether policies read columns of that name; others may hold what they like."""
+    return key == ACTION or key.startswith(OBS_PREFIX)
 
 
 def cameras_without_files(root: Path, features: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -157,7 +180,7 @@ def prepare(root: Path, plan: Plan, *, output: Path | None = None) -> Path:
 
     Raises:
         FileExistsError: `output` exists and is not an empty folder; it is left as it was.
-        ValueError: a column does not hold what the plan says of it.
+        ValueError: a column does not hold what the plan says of it, or numbers that are not finite.
     """
     root = Path(root).expanduser().resolve()
     target = root if output is None else refuse_existing(output)
@@ -166,6 +189,9 @@ def prepare(root: Path, plan: Plan, *, output: Path | None = None) -> Path:
         if plan.convert:  # now the files can be looked for
             plan.drop += [k for k in make_plan(source).drop if k not in plan.drop]
         copy_rest(source, new, without=plan.drop)
+        for old, name in plan.rename.items():  # a video's files bear its name
+            if (new / "videos" / old).is_dir():
+                (new / "videos" / old).rename(new / "videos" / name)
         _rewrite_all(source, new, plan)
     return target
 
@@ -202,6 +228,10 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
     for path in data_files(source):
         rewrite(path, partial / path.relative_to(source), with_columns)
     lengths = _lengths(source)
+    measured = {
+        old: flat_names(old_features[old].get("names")) for old in new_names if new_names[old] in plan.statistics
+    }
+    check_columns(source, measured)
     found = {key: episode_statistics(columns[key], lengths) for key in plan.statistics if key in columns}
     for path in episode_files(source):
         rewrite(path, partial / path.relative_to(source), lambda table: _episodes_table(table, plan, found))

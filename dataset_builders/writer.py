@@ -28,7 +28,7 @@ from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, update_chunk_file_indi
 from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing, written_whole
-from dataset_builders.videos import write_videos
+from dataset_builders.videos import encode_pictures, write_videos
 
 PROVENANCE_PATH = "meta/provenance.json"
 # LeRobot writes a row group per episode. That is costly when they are short: 20,000 of ten steps take 48 MB and 15 s to
@@ -70,7 +70,7 @@ def write_dataset(
         provenance: origin of the data, for `meta/provenance.json` (info.json keeps no unknown keys); the package's
             version and the command line are added.
         progress: whether to show a progress bar, on a terminal.
-        pictures: feature that is a video -> its N pictures, (H, W, 3) uint8, as they come.
+        pictures: feature that is a video or an image -> its N pictures, (H, W, 3) uint8, as they come.
 
     Returns:
         `root`, as a path.
@@ -243,26 +243,35 @@ def _write_all(
         statistics[name] = episode_statistics(column, lengths)
         bar.update()
     videos: dict[str, list] = {}
+    stored: dict[str, pa.Array] = {}
     whole = {name: dataset_statistics(values) for name, values in statistics.items()}
     for key, frames in pictures.items():
-        places, found = write_videos(meta, key, frames, lengths)
+        if key in meta.video_keys:
+            places, found = write_videos(meta, key, frames, lengths)
+            videos |= places
+        else:
+            stored[key], found = encode_pictures(frames, lengths)
         whole[key] = aggregate_feature_stats(found)
-        videos |= places
         videos |= {f"stats/{key}/{name}": [each[name].tolist() for each in found] for name in found[0]}
     write_stats(whole, meta.root)
     bar.update()
-    chunk, file = _write_tables(meta, meta.data_path, _data_table(meta, columns), lengths, ROW_GROUP_FRAMES)
+    chunk, file = _write_tables(meta, meta.data_path, _data_table(meta, columns, stored), lengths, ROW_GROUP_FRAMES)
     bar.update()
     episodes = _episode_columns(lengths, tasks, chunk, file, statistics)
     _write_episodes(meta, episodes | {name: pa.array(values) for name, values in videos.items()})
     bar.update()
 
 
-def _data_table(meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray]) -> pa.Table:
-    """The columns as LeRobot stores them: (N,) where D = 1, lists of D numbers otherwise."""
+def _data_table(
+    meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray], stored: Mapping[str, pa.Array]
+) -> pa.Table:
+    """The columns as LeRobot stores them: (N,) where D = 1, lists of D numbers otherwise; `stored` ones as they are."""
     schema = get_hf_features_from_features(meta.features).arrow_schema
     arrays = []
     for field in schema:
+        if field.name in stored:
+            arrays.append(stored[field.name])
+            continue
         column = columns[field.name]
         flat = pa.array(column.ravel())
         array = flat if column.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, column.shape[1])

@@ -16,6 +16,7 @@ from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_IMAGES, OBS_PREFIX
 
 from lerobot_unimask.data.factors import (
     TASK,
@@ -364,10 +365,13 @@ class UniMASKConfig(PreTrainedConfig):
                     f"The camera {key!r} is not among the dataset's, or named twice; its colour cameras are "
                     f"{', '.join(colour) or 'none'}."
                 )
+            if not key.startswith(OBS_PREFIX):
+                raise ValueError(
+                    f"LeRobot hands policies no pictures of a column named {key!r}: `unimask prepare` names it "
+                    f"{OBS_IMAGES}.{key}, --policy.cameras=[] reads none."
+                )
         if wanted and self.network != "transformer":
             raise ValueError(f"network={self.network} reads no cameras: leave them out with --policy.cameras=[].")
-        if wanted and self.compile_model:
-            raise ValueError("compile_model reads no cameras: choose --policy.cameras=[] or leave it out.")
         return list(wanted)
 
     def _named_cameras(self, entries: dict[str, dict[str, Any]], taken: Iterable[str]) -> dict[str, Camera]:

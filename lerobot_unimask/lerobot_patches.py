@@ -4,10 +4,12 @@ policies.
 `UNIMASK_PATCH_LEROBOT=0` in the environment turns all of them off.
 """
 
+import contextlib
 import functools
 import logging
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
 from lerobot_unimask.data.episodes import read_info
+from lerobot_unimask.data.taking_over import keep_to
 from lerobot_unimask.sharing import hub
 
 logger = logging.getLogger(__name__)
@@ -65,7 +68,8 @@ def _read_as_this_policy_needs() -> None:
     is read in batches gets no DataLoader workers, of which LeRobot starts four: each imports LeRobot first, some 20 s,
     for batches that take a millisecond, and from the second epoch on they see another order of the data. Of cameras,
     those that the policy reads are decoded once, others not at all; LeRobot decodes all of a window's frames of all of
-    them at each read.
+    them at each read. Columns of texts, which cannot be read in batches, are left out. And a policy is to know which
+    episodes are read, where LeRobot tells it of all of them.
 
     Other policies: unchanged.
     """
@@ -85,9 +89,11 @@ def _read_as_this_policy_needs() -> None:
         root = Path(cfg.dataset.root or "")
         if cfg.dataset.root and (root / "meta" / "info.json").exists():
             read_info(root)  # a damaged one ends in one sentence
-        dataset = lerobots_make_dataset(cfg)
+        with _without_imagenet_statistics(cfg):
+            dataset = lerobots_make_dataset(cfg)
         opened[:] = [dataset]
         reads.read_cameras(dataset, cfg.trainable_config)
+        keep_to(dataset.meta, dataset.episodes)
         if cfg.num_workers and getattr(dataset, "__getitems__", None):
             logger.info("Windows are read in batches, faster than workers start: num_workers=0.")
             cfg.num_workers = 0
@@ -95,10 +101,12 @@ def _read_as_this_policy_needs() -> None:
 
     @functools.wraps(lerobots_make_both)
     def make_train_eval_datasets(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-        both = lerobots_make_both(cfg)
+        with _without_imagenet_statistics(cfg):
+            both = lerobots_make_both(cfg)
         if cfg.trainable_config.type == "unimask" and both[1] is not None:  # opened anew, each with its episodes
             for part in both:
                 reads.read_cameras(part, cfg.trainable_config, opened[0])
+                keep_to(part.meta, opened[0].episodes)
             cfg.eval_steps = cfg.eval_steps or cfg.steps
         opened.clear()
         return both
@@ -108,6 +116,19 @@ def _read_as_this_policy_needs() -> None:
     for name in ("lerobot.datasets", "lerobot.scripts.lerobot_train"):  # where LeRobot has imported it by name
         if name in sys.modules:
             vars(sys.modules[name])["make_train_eval_datasets"] = make_train_eval_datasets
+
+
+@contextlib.contextmanager
+def _without_imagenet_statistics(cfg: TrainPipelineConfig) -> Iterator[None]:
+    """LeRobot puts them in the place of each camera's own, and ends in a KeyError where the dataset has none; this
+    policy reads neither."""
+    asked = cfg.dataset.use_imagenet_stats
+    if cfg.trainable_config.type == "unimask":
+        cfg.dataset.use_imagenet_stats = False
+    try:
+        yield
+    finally:
+        cfg.dataset.use_imagenet_stats = asked
 
 
 def _say_in_a_line_what_decodes() -> None:

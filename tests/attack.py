@@ -3,71 +3,45 @@
     OMP_NUM_THREADS=1 uv run python tests/attack.py --output=docs/results/reliability.json
 
 An attempt is lost if it ends in another error than one clear sentence, takes longer than `SECONDS`, changes an answer
-that it must not change, or leaves something half-made. `test_attack.py` makes a few attempts of each kind.
+that it must not change, or leaves something half-made. An attack that the record has already is not made again: who is
+interrupted gives the same command. `test_attack.py` makes a few attempts of each kind.
 """
 
 import argparse
-import atexit
 import json
-import logging
-import os
 import random
 import shutil
-import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
-from hub_server import Hub
+import attack_ground  # noqa: F401 (first: it sets up what others read as they are imported)
+import attack_hindrances as hindrances
+import torch
+from attack_ground import (
+    HOME,
+    HUB,
+    Attack,
+    Outcome,
+    attempt,
+    complete,
+    push_dataset,
+    push_policy,
+    small_policy,
+)
+from huggingface_hub.utils import _http
+from safetensors.torch import load_file, save_file
 
-HUB = Hub({"token": "me"}).__enter__()
-HOME = Path(tempfile.mkdtemp(prefix="attack_"))
-OWNER = os.getpid()
-atexit.register(lambda: os.getpid() == OWNER and shutil.rmtree(HOME, ignore_errors=True))
-os.environ.update(HF_ENDPOINT=HUB.endpoint, HF_HOME=str(HOME), HF_TOKEN="token", HF_HUB_DISABLE_XET="1")
-os.environ.update(HF_HUB_OFFLINE="0", HF_HUB_DISABLE_PROGRESS_BARS="1", HF_HUB_DOWNLOAD_TIMEOUT="2")
-
-import torch  # noqa: E402
-from huggingface_hub.utils import _http  # noqa: E402
-from safetensors.torch import load_file, save_file  # noqa: E402
-
-import lerobot_policy_unimask  # noqa: E402, F401
-from dataset_builders.doorkey import build_doorkey  # noqa: E402
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy  # noqa: E402
-from lerobot_unimask.data.checkpoints import last_checkpoint  # noqa: E402
-from lerobot_unimask.data.episodes import check_folder, first_windows, open_dataset, read_info  # noqa: E402
-from lerobot_unimask.language.masks import TASKS, parse, tabulate  # noqa: E402
-from lerobot_unimask.language.training_masks import TrainingMasks  # noqa: E402
-from lerobot_unimask.records import markdown_table, versions, write_json  # noqa: E402
-from lerobot_unimask.sharing import cards, hub  # noqa: E402
-
-logging.getLogger("lerobot").setLevel(logging.ERROR)
-
-SECONDS = 5.0  # of processor time, for one attempt
-EXPECTED = (ValueError, OSError)  # what the commands print as one sentence; MaskError and HubError are among them
-Outcome = str | None  # what was lost, or nothing
-
-
-def attempt(call: Callable[[], Any], check: Callable[[Any], Outcome] = lambda _: None) -> tuple[str, Outcome]:
-    """ "refused" or "held", and what was lost by it."""
-    began = time.process_time()
-    kind, lost = "held", None
-    try:
-        lost = check(call())
-    except EXPECTED as error:
-        kind = "refused"
-        if len(str(error)) > 5000 or not str(error):
-            lost = f"an error of {len(str(error))} characters"
-    except Exception as error:
-        lost = f"{type(error).__name__}: {error}"
-    if time.process_time() - began > SECONDS:
-        lost = f"{time.process_time() - began:.1f} s"
-    return kind, lost
-
+from dataset_builders.doorkey import build_doorkey
+from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask.data.episodes import first_windows, open_dataset, read_info
+from lerobot_unimask.language.masks import TASKS, parse, tabulate
+from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.records import markdown_table, versions, write_json
+from lerobot_unimask.sharing import cards
 
 # --- Texts, values, files --------------------------------------------------------------------------------------------
 
@@ -271,148 +245,11 @@ def pushes(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
         )
 
 
-def push_policy(folder: Path, name: str) -> str:
-    return hub.push_policy(
-        folder, name, cards.policy_card(UniMASKPolicy.from_pretrained(folder).card_facts(folder), name)
-    )
-
-
-def push_dataset(root: Path, name: str) -> str:
-    return hub.push_dataset(root, name, cards.dataset_card(root, name))
-
-
-def complete(repository, what: str) -> bool:
-    wanted = {"model.safetensors", "config.json"} if what == "model" else {"meta/info.json", "meta/stats.json"}
-    return {*wanted, "README.md"} <= set(repository.files)
-
-
-# --- Kills and full disks --------------------------------------------------------------------------------------------
-
-
-def forked(work: Callable[[], Any], *, kill_after: float | None = None, most_bytes: int | None = None) -> int | None:
-    """Run in a forked process, that is killed or may write no larger file; its exit status, None if it was killed."""
-    child = os.fork()
-    if child == 0:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        if most_bytes is not None:
-            import resource
-
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-        try:
-            work()
-            os._exit(0)
-        except EXPECTED:
-            os._exit(2)
-        except BaseException:
-            os._exit(1)
-    if kill_after is not None:
-        time.sleep(kill_after)
-        os.kill(child, signal.SIGKILL)
-    status = os.waitpid(child, 0)[1]
-    return None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
-
-
-def duration(work: Callable[[], Any]) -> float:
-    """Seconds of the work in a forked process, where it is not killed."""
-    began = time.monotonic()
-    status = forked(work)
-    assert status == 0, f"status {status}"
-    return time.monotonic() - began
-
-
-def killed_builds(count: int, _: Path) -> Iterator[tuple[str, Outcome]]:
-    """A build killed at any time leaves no dataset or a whole one; the next build succeeds."""
-    draw = random.Random(0)
-    whole = duration(lambda: build_doorkey(HOME / "warm", episodes=40, progress=False))
-    for i in range(count):
-        place = HOME / "builds" / str(i)
-        forked(lambda p=place: build_doorkey(p, episodes=40, progress=False), kill_after=draw.uniform(0, 1.2 * whole))
-        kind, lost = "refused", None
-        if place.exists():
-            kind, lost = attempt(lambda p=place: (check_folder(p), first_windows(open_dataset(CONFIG(), p))))
-            lost = lost or (None if kind == "held" else "half a dataset")
-        else:
-            again, lost = attempt(lambda p=place: build_doorkey(p, episodes=40, progress=False))
-            lost = lost or (None if again == "held" else "not to be built afterwards")
-        shutil.rmtree(place, ignore_errors=True)
-        yield kind, lost
-
-
-def killed_pushes(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
-    """A push killed at any time leaves all of it or nothing, and the next one finishes it."""
-    folder, draw = HOME / "killed", random.Random(0)
-    small_policy(root).save_pretrained(folder)
-    seconds = duration(lambda: push_policy(folder, "me/unkilled"))
-    for i in range(count):
-        name = f"me/killed_{i}"
-        forked(lambda n=name: push_policy(folder, n), kill_after=draw.uniform(0, 1.2 * seconds))
-        there = HUB.repositories.get(("model", name))
-        whole = there is not None and complete(there, "model")
-        lost = "part of it is there" if there and len(there.files) > 1 and not whole else None
-        again, wrong = attempt(lambda n=name: push_policy(folder, n))
-        yield "held" if whole else "refused", lost or wrong or (None if again == "held" else "unfinished")
-
-
-def full_disks(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
-    """No file may grow beyond some bytes: a build, a record and a policy are there in full, or not at all."""
-    draw, policy = random.Random(0), small_policy(root)
-    record = HOME / "record.json"
-    for i in range(count):
-        most = int(10 ** draw.uniform(1, 5.5))
-        if i % 2:
-            place = HOME / "full" / str(i)
-            status = forked(lambda p=place: build_doorkey(p, episodes=40, progress=False), most_bytes=most)
-            whole = place.exists() and attempt(lambda p=place: open_dataset(policy.config, p))[0] == "held"
-            lost = None if whole or not place.exists() else "half a dataset"
-        else:
-            write_json(record, {"before": 1}, say=False)
-            status = forked(lambda: write_json(record, {"after": list(range(2000))}, say=False), most_bytes=most)
-            lost = None if set(json.loads(record.read_text())) <= {"before", "after"} else "half a record"
-        yield "held" if status == 0 else "refused", lost
-
-
-def killed_saves(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
-    """A run killed while it saves its checkpoints, one after another: its last whole one is taken."""
-    from lerobot.common.train_utils import update_last_checkpoint
-
-    draw, policy = random.Random(0), small_policy(root)
-    seconds = duration(lambda: policy.save_pretrained(HOME / "saves" / "one"))
-    for i in range(count):
-        run = HOME / "saves" / str(i)
-
-        def save(run=run):
-            for step in range(1, 1000):
-                folder = run / "checkpoints" / f"{step:06d}"
-                policy.updates.fill_(step)
-                policy.save_pretrained(folder / "pretrained_model")
-                if step % 2:  # every other time, as if the link had not been set yet
-                    update_last_checkpoint(folder)
-
-        forked(save, kill_after=draw.uniform(0, 5 * seconds))
-        begun = list(run.glob("checkpoints/*/pretrained_model/model.safetensors"))
-        kind, lost = attempt(lambda run=run: UniMASKPolicy.from_pretrained(last_checkpoint(run)))
-        yield kind, lost or (None if kind == "held" or len(begun) <= 1 else "no whole checkpoint")
-        shutil.rmtree(run, ignore_errors=True)
-
-
 # --- All of it -------------------------------------------------------------------------------------------------------
 
 
-def CONFIG() -> UniMASKConfig:
-    return UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16)
-
-
-def small_policy(root: Path) -> UniMASKPolicy:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-    config, meta = CONFIG(), LeRobotDatasetMetadata("local/dataset", root=root)
-    config.set_dataset_feature_metadata(meta.features)
-    return UniMASKPolicy(config, dataset_stats=meta.stats).eval()
-
-
-ATTACKS: dict[str, tuple[Callable[[int, Path], Iterator[tuple[str, Outcome]]], int]] = {
-    "mask texts, made of the language's pieces": (mask_texts, 200_000),
+ATTACKS: dict[str, tuple[Attack, int]] = {
+    "mask texts, made of the language's pieces": (mask_texts, 1_000_000),
     "hidden values replaced": (hidden_values, 500),
     "weights: not finite, of other types and shapes, cut, other bytes": (weights, 300),
     "entries of a policy's config.json": (configs, 2_000),
@@ -420,26 +257,40 @@ ATTACKS: dict[str, tuple[Callable[[int, Path], Iterator[tuple[str, Outcome]]], i
     "calls in Python with values of any kind": (calls, 20_000),
     "pulls from a Hub at fault": (pulls, 60),
     "pushes to a Hub at fault": (pushes, 40),
-    "kills while building": (killed_builds, 100),
-    "kills while saving checkpoints": (killed_saves, 100),
-    "kills while pushing": (killed_pushes, 30),
-    "disks that are full": (full_disks, 100),
+    "kills while building": (hindrances.killed_builds, 100),
+    "kills while preparing": (hindrances.killed_prepares, 60),
+    "kills while training": (hindrances.killed_trainings, 20),
+    "kills while saving checkpoints": (hindrances.killed_saves, 100),
+    "kills of studies": (hindrances.killed_studies, 20),
+    "kills while pushing": (hindrances.killed_pushes, 30),
+    "full disks while building and recording": (hindrances.full_disks, 100),
+    "full disks while training": (hindrances.full_trainings, 20),
+    "full disks while frames are cached": (hindrances.full_caches, 40),
+    "homes that are absent, a file or read-only, and locale C": (hindrances.homes, 5),
 }
 
 
-def attack(share: float, write: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+def attack(
+    share: float, write: Callable[[dict[str, Any]], None], before: dict[str, Any], only: str = ""
+) -> dict[str, Any]:
     """A record: for each attack how many attempts were made, refused, held and lost, with the first losses. It is
-    written after each attack."""
+    written after each attack.
+
+    Args:
+        before: attacks that a record has already; they are not made again.
+        only: text that the names of those to make hold.
+    """
     _http.time.sleep = lambda seconds, sleep=time.sleep: sleep(min(seconds, 0.01))  # the client tries again by itself
     root = build_doorkey(HOME / "data", episodes=30, progress=False)
-    found: dict[str, Any] = {}
-    record = {
+    found: dict[str, Any] = dict(before)
+    record: dict[str, Any] = {
         "what": "attempts that ended in one sentence (refused), had no effect (held), or lost something",
         "units": "attempts; seconds: wall time",
         "attacks": found,
         "versions": versions(),
     }
-    for name, (tries, count) in ATTACKS.items():
+    for name in [name for name in ATTACKS if name not in before and only in name]:
+        tries, count = ATTACKS[name]
         began, outcomes, losses = time.time(), {"refused": 0, "held": 0}, []
         for kind, lost in tries(max(2, int(share * count)), root):
             outcomes[kind] += 1
@@ -449,6 +300,7 @@ def attack(share: float, write: Callable[[dict[str, Any]], None]) -> dict[str, A
         if losses:
             found[name]["losses"] = [str(loss)[:300] for loss in sorted(set(losses))[:10]]
         print(json.dumps({name: found[name]}), file=sys.stderr, flush=True)
+        record["attacks"] = {name: found[name] for name in ATTACKS if name in found}
         write(record)
     return record
 
@@ -465,6 +317,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path)
     parser.add_argument("--share", type=float, default=1.0, help="of the attempts")
+    parser.add_argument("--only", default="", help="attacks whose name holds this text")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     command = f"python tests/attack.py --share={arguments.share}"
@@ -473,6 +326,9 @@ if __name__ == "__main__":
         if arguments.output:
             write_json(arguments.output, {**record, "command": command}, say=False)
 
-    record = attack(arguments.share, write)
+    before = json.loads(arguments.output.read_text()) if arguments.output and arguments.output.exists() else {}
+    if before.get("command", command) != command:
+        parser.error(f"{arguments.output} is of another command, {before['command']}: choose another file.")
+    record = attack(arguments.share, write, before.get("attacks", {}), arguments.only)
     print(table(record))
     sys.exit(any(entry["lost"] for entry in record["attacks"].values()))

@@ -13,6 +13,8 @@ from lerobot_unimask.cli import main
 from lerobot_unimask.data import frames
 from lerobot_unimask.envs.doorkey.environment import DoorKeyEnv
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
+from lerobot_unimask.envs.maze2d.maze import parse_maze
+from lerobot_unimask.envs.maze2d.rendering import camera_picture
 from lerobot_unimask.evaluating import rollout
 from lerobot_unimask.training import Trainer
 
@@ -63,6 +65,25 @@ def test_doorkeys_pictures_are_those_of_the_environment(tmp_path):
             difference = np.abs(seen(dataset, 10 * episode + step) - observation["pixels"]["top"].astype(int))
             assert difference.mean() < 6
             observation = env.step(item["action"].item())[0]
+
+
+def test_pictures_in_place_of_a_video_are_exact(maze_root, tmp_path):
+    root = build_maze2d(
+        tmp_path / "maze", episodes=2, maze="umaze", camera=True, use_videos=False, hide_goal=True, progress=False
+    )
+    dataset, video = (LeRobotDataset("local/maze2d", root=folder) for folder in (root, maze_root))
+    assert dataset.meta.image_keys == [KEY]
+    assert not list(root.rglob("*.mp4"))
+    for name, value in video.meta.stats[KEY].items():  # of the pictures as they were drawn, both
+        np.testing.assert_array_equal(dataset.meta.stats[KEY][name], value)
+    maze = parse_maze("umaze")
+    plain = build_maze2d(tmp_path / "plain", episodes=2, maze="umaze", progress=False)
+    states = LeRobotDataset("local/maze2d", root=plain).hf_dataset["observation.state"]
+    for frame in (0, 250):
+        x, y, goal_x, goal_y = states[frame].tolist()
+        assert np.array_equal(seen(dataset, frame), camera_picture(maze, (int(goal_x), int(goal_y)), (x, y)))
+    cached = frames.cached_frames(dataset, KEY, (70, 70))
+    assert np.array_equal(cached[250].transpose(1, 2, 0), seen(dataset, 250))
 
 
 @pytest.mark.parametrize(

@@ -309,8 +309,6 @@ def test_cameras_are_chosen(make):
         make(cameras=["observation.images.side"])
     with pytest.raises(ValueError, match="network=feedforward reads no cameras"):
         make(network="feedforward")
-    with pytest.raises(ValueError, match="compile_model reads no cameras"):
-        make(compile_model=True)
 
 
 def test_names_that_are_taken_or_cannot_be_written_become_others(tiny_policy):

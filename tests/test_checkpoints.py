@@ -266,6 +266,20 @@ def test_a_checkpoint_of_format_1_gives_the_answers_that_it_gave(folder, tmp_pat
                 torch.testing.assert_close(said, before, equal_nan=True, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("folder", FORMAT_1, ids=lambda folder: folder.name)
+def test_a_checkpoint_of_format_1_acts_with_all_that_its_window_holds(folder):
+    """LeRobot's default for n_obs_steps, 1, stands in its config, which nothing read then."""
+    policy = UniMASKPolicy.from_pretrained(folder)
+    assert policy.config.n_obs_steps is None
+    size = policy.factors["s"].size
+    states = [torch.full((1, size), value) for value in (1.0, 3.0, 2.0)]
+    actions = [policy.select_action({"observation.state": state}, mask="behavior_cloning") for state in states]
+    given = {f"s[{k}]": state[0].tolist() for k, state in enumerate(states)}
+    given |= {f"a[{k}]": action[0].tolist() for k, action in enumerate(actions[:2])}
+    expected = policy.infer(None, "a[2] | s[:3], a[:2]", given=given).most_likely("a")[:, 2]
+    torch.testing.assert_close(actions[2].float(), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_lerobots_own_commands_say_how_to_bring_format_1_up_to_date():
     with pytest.raises(Exception, match="save_pretrained") as raised:
         PreTrainedConfig.from_pretrained(FORMAT_1[0])

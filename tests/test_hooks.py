@@ -3,15 +3,20 @@
 import json
 import logging
 import re
+import sys
 
 import commands
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-from policies import CONTINUOUS_STATS
+from accelerate import Accelerator
+from lerobot.scripts import lerobot_train
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, TRAIN_FLAGS
 from torch import nn
 
+from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.envs.configs import GymnasiumEnvConfig
 from lerobot_unimask.envs.returns import ReportReturn
 
@@ -40,6 +45,40 @@ def test_a_windows_part_is_its_own(tiny_policy, doorkey_batch):
 def test_another_reduction_is_refused(tiny_policy, doorkey_batch):
     with pytest.raises(ValueError, match=r"sum.*mean or none"):
         tiny_policy().forward(doorkey_batch, reduction="sum")
+
+
+def test_lerobot_train_learns_from_what_makes_progress_alone(doorkey_root, tmp_path, monkeypatch):
+    """RA-BC: every other episode makes progress, which its windows are weighted with, the others none."""
+    frames = pd.DataFrame({"index": range(300), "episode_index": np.arange(300) // 10})
+    direction = np.where(frames["episode_index"] % 2, -0.1, 0.1)
+    frames["progress_sparse"] = 0.5 + direction * (frames["index"] % 10) / 2
+    frames.to_parquet(tmp_path / "progress.parquet")
+    losses, learnt = [], []
+    forward, backward = UniMASKPolicy.forward, Accelerator.backward
+
+    def recording_forward(self, batch, reduction="mean"):
+        each, parts = forward(self, batch, reduction)
+        losses.append(each.detach()[batch["index"] // 10 % 2 == 0].mean())
+        return each, parts
+
+    def recording_backward(self, loss, **settings):
+        learnt.append(loss.detach())
+        backward(self, loss, **settings)
+
+    monkeypatch.setattr(UniMASKPolicy, "forward", recording_forward)
+    monkeypatch.setattr(Accelerator, "backward", recording_backward)
+    flags = [
+        *TRAIN_FLAGS,
+        "--dataset.repo_id=local/doorkey",
+        f"--dataset.root={doorkey_root}",
+        "--steps=3",
+        "--batch_size=8",
+    ]
+    flags += ["--sample_weighting.type=rabc", f"--sample_weighting.progress_path={tmp_path / 'progress.parquet'}"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags, "--num_workers=0", f"--output_dir={tmp_path / 'run'}"])
+    lerobot_train.main()
+    assert len(learnt) == 3
+    torch.testing.assert_close(torch.stack(learnt), torch.stack(losses), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("network", ["transformer", "feedforward", "decision_transformer"])
@@ -120,6 +159,14 @@ def test_the_return_so_far_is_the_sum_of_rewards():
         observation, reward, *_ = env.step(np.array([0.5], np.float32))
         paid += reward
     assert env.reset(seed=0)[0]["return_so_far"] == 0
+
+
+def test_going_on_with_a_column_of_another_name_is_refused_with_the_command_that_renames_it(tiny_policy):
+    """LeRobot tells a policy nothing of --rename_map, and what is kept of a dataset is read from its files."""
+    policy = tiny_policy("gaussian")
+    renamed = {key.replace("state", "qpos"): entry for key, entry in CONTINUOUS_FEATURES.items()}
+    with pytest.raises(ValueError, match="unimask prepare --rename"):
+        policy.config.set_dataset_feature_metadata(renamed)
 
 
 @pytest.mark.parametrize(("task", "message"), [(None, "env.task"), ("CartPole-v1", "continuous")])

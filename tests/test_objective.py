@@ -7,12 +7,16 @@ import traceback
 
 import pytest
 import torch
+from policies import CONTINUOUS_FEATURES
 
 from lerobot_unimask import objective
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
+TOP = "observation.images.top"
+CAMERA = {TOP: {"dtype": "video", "shape": (24, 32, 3), "names": ["height", "width", "channels"]}}
 NETWORKS = {
     "both": {"attention": "both"},
+    "seeing": {"features": CONTINUOUS_FEATURES | CAMERA, "image_size": [24, 32]},
     "stacked": {"attention": "bidirectional", "token_layout": "stacked"},
     "causal": {"attention": "causal", "training_masks": "behavior_cloning"},
     "feedforward": {"network": "feedforward"},
@@ -86,7 +90,9 @@ def pair(tiny_policy, kind, **settings):
 def test_an_update_is_one_graph_with_eagers_losses(tiny_policy, batch_of, capture, settings):
     graphs = capture("aot_eager")
     captured, eager = pair(tiny_policy, "gaussian", **settings)
-    batches = [batch_of("gaussian")] * 5
+    batch = batch_of("gaussian")
+    pictures = torch.randint(256, (5, 10, 3, 24, 32), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    batches = [{**batch, **dict.fromkeys(settings.get("features", {}).keys() & {TOP}, pictures)}] * 5
     torch.testing.assert_close(updates(captured, batches), updates(eager, batches), rtol=1e-4, atol=1e-4)
     assert len(graphs) == 1
 

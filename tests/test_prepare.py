@@ -13,8 +13,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from policies import SMALL_FLAGS
 
 from dataset_builders.prepare import make_plan, prepare
-from lerobot_unimask import UniMASKPolicy, cli, query
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy, cli, query
 from lerobot_unimask.data.episodes import open_dataset, read_window
+from lerobot_unimask.records import read_json
 
 JOINTS = ["shoulder", "elbow"]
 LENGTHS = [12, 15, 11]
@@ -22,10 +23,11 @@ LENGTHS = [12, 15, 11]
 
 def record(root, features, frames, **settings):
     """A dataset as LeRobot's own recorder writes it; `frames(episode, step)` -> one frame."""
-    dataset = LeRobotDataset.create("me/robot", fps=30, features=features, root=root, use_videos=False, **settings)
+    videos = any(entry["dtype"] == "video" for entry in features.values())
+    dataset = LeRobotDataset.create("me/robot", fps=30, features=features, root=root, use_videos=videos, **settings)
     for episode, length in enumerate(LENGTHS):
         for step in range(length):
-            dataset.add_frame({**frames(episode, step), "task": "wave"})
+            dataset.add_frame({"task": "wave", **frames(episode, step)})
         dataset.save_episode()
     dataset.finalize()
     return root
@@ -74,6 +76,35 @@ def blind(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def pictured(tmp_path_factory):
+    """After the LIBERO and DROID datasets: cameras that are not named as observations, one a video, one in the table,
+    without statistics; texts; several tasks."""
+    camera = {"shape": (32, 32, 3), "names": ["height", "width", "channel"]}
+    root = record(
+        tmp_path_factory.mktemp("pictured") / "data",
+        {
+            "image": {"dtype": "video", **camera},
+            "wrist_image": {"dtype": "image", **camera},
+            "state": {"dtype": "float32", "shape": (2,), "names": {"motors": JOINTS}},
+            "actions": {"dtype": "float32", "shape": (2,), "names": JOINTS},
+            "instruction": {"dtype": "string", "shape": (1,), "names": None},
+        },
+        lambda episode, step: {
+            "image": np.full((32, 32, 3), 10 * step, np.uint8),
+            "wrist_image": np.full((32, 32, 3), 100 + step, np.uint8),
+            "state": waves(episode, step),
+            "actions": waves(episode, step + 1),
+            "instruction": "wave",
+            "task": f"wave {episode % 2}",
+        },
+    )
+    path = root / "meta" / "stats.json"
+    stats = json.loads(path.read_text())
+    path.write_text(json.dumps({key: value for key, value in stats.items() if "image" not in key}))
+    return root
+
+
+@pytest.fixture(scope="module")
 def old(blind, tmp_path_factory):
     """The same recording in format v2.1, as LeRobot wrote it before."""
     root = tmp_path_factory.mktemp("old") / "data"
@@ -111,7 +142,7 @@ def files(root):
     return {path.relative_to(root): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-@pytest.mark.parametrize("form", ["renamed", "blind", "old"])
+@pytest.mark.parametrize("form", ["renamed", "blind", "pictured", "old"])
 def test_a_recording_of_others_trains_resumes_and_is_asked(form, request, tmp_path, capsys):
     found = request.getfixturevalue(form)
     before = files(found)
@@ -120,6 +151,7 @@ def test_a_recording_of_others_trains_resumes_and_is_asked(form, request, tmp_pa
     assert str(tmp_path / "data") in capsys.readouterr().out
     data = ["--dataset.repo_id=me/robot", f"--dataset.root={tmp_path / 'data'}"]
     flags = ["--policy.type=unimask", "--policy.push_to_hub=false", *SMALL_FLAGS, "--batch_size=4", "--save_freq=2"]
+    flags.append("--policy.image_size=[32, 32]")
     commands.check("lerobot-train", *flags, *data, "--steps=2", "--output_dir=run", cwd=tmp_path)
     config = "--config_path=run/checkpoints/last/pretrained_model/train_config.json"
     commands.check("lerobot-train", config, "--resume=true", "--steps=4", cwd=tmp_path)
@@ -158,12 +190,46 @@ def test_joint_names_are_kept(renamed, blind, tmp_path):
     assert features["observation.state"]["shape"] == [2]
 
 
+def test_cameras_get_names_that_policies_are_handed(pictured, tmp_path):
+    with pytest.raises(ValueError, match=r"unimask prepare.* observation\.images\.image"):
+        UniMASKConfig(device="cpu").cameras_of(read_json(pictured / "meta" / "info.json")["features"])
+    made = prepare(pictured, make_plan(pictured), output=tmp_path / "made")
+    dataset, before = LeRobotDataset("me/robot", root=made), LeRobotDataset("me/robot", root=pictured)
+    assert dataset.meta.camera_keys == ["observation.images.image", "observation.images.wrist_image"]
+    for key in ("image", "wrist_image"):
+        assert torch.equal(dataset[17][f"observation.images.{key}"], before[17][key])
+    assert dataset[17]["instruction"] == "wave"
+    kept = prepare(pictured, make_plan(pictured, drop=["image"]), output=tmp_path / "kept")
+    assert LeRobotDataset("me/robot", root=kept).meta.camera_keys == ["observation.images.wrist_image"]
+
+
+def test_texts_are_not_in_the_way_of_reading_in_batches(pictured, tmp_path):
+    made = prepare(pictured, make_plan(pictured), output=tmp_path / "made")
+    dataset = open_dataset(UniMASKConfig(device="cpu", cameras=[]), made)
+    batch = dataset.__getitems__([3, 30]).batch
+    assert "instruction" not in batch
+    assert batch["task"] == ["wave 0", "wave 0"]
+    np.testing.assert_allclose(batch["action"][1, 0], waves(2, 4), atol=1e-6)
+
+
 def test_statistics_are_those_of_the_numbers(renamed, tmp_path):
     made = prepare(renamed, make_plan(renamed), output=tmp_path / "made")
     values = np.concatenate([[waves(e, t) for t in range(n)] for e, n in enumerate(LENGTHS)])
     stats = json.loads((made / "meta" / "stats.json").read_text())["observation.state"]
     np.testing.assert_allclose(stats["mean"], values.mean(0), atol=1e-6)
     np.testing.assert_allclose(stats["std"], values.std(0), atol=1e-6)
+
+
+def test_statistics_that_are_unsound_are_computed(blind, tmp_path):
+    copy = shutil.copytree(blind, tmp_path / "data")
+    path = copy / "meta" / "stats.json"
+    stats = json.loads(path.read_text())
+    path.write_text(json.dumps({**stats, "action": {**stats["action"], "std": [float("nan"), 1.0]}}))
+    plan = make_plan(copy)
+    assert plan.statistics == ["action"]
+    made = prepare(copy, plan, output=tmp_path / "made")
+    again = json.loads((made / "meta" / "stats.json").read_text())["action"]
+    np.testing.assert_allclose(again["std"], stats["action"]["std"], rtol=1e-5)
 
 
 @pytest.mark.parametrize(("given", "count"), [("auto", 3), ("5", 5)])

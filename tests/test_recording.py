@@ -1,7 +1,10 @@
 """A robot arm's recording, two cameras of 640 x 480 at 30 Hz, made by LeRobot's own writer from noise and ramps: it is
 trained on through lerobot-train, resumed, questioned and acted from; other policies read it as without the plugin."""
 
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -136,3 +139,41 @@ def test_other_policies_read_what_they_read_without_the_plugin(recording, monkey
     assert one.keys() == other.keys()
     for key, value in other.items():
         assert torch.equal(one[key], value) if isinstance(value, torch.Tensor) else one[key] == value, key
+
+
+WITHOUT = "import sys; sys.modules['lerobot_policy_unimask'] = None; "  # LeRobot's discovery goes on without it
+OTHERS = {
+    "act": ["--policy.dim_model=32", "--policy.n_heads=4", "--policy.dim_feedforward=32", "--policy.chunk_size=3"],
+    "diffusion": ["--policy.down_dims=[16, 32]", "--policy.horizon=4", "--policy.drop_n_last_frames=0"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("other", OTHERS)
+def test_other_policies_train_as_without_the_plugin(recording, tmp_path, other):
+    """In processes of their own; the same losses and gradients, to the bit."""
+    here = Path(__file__).parent
+    flags = [f"--policy.type={other}", *OTHERS[other], "--policy.n_action_steps=2", "--policy.push_to_hub=false"]
+    flags += ["--policy.pretrained_backbone_weights=null", "--policy.device=cpu", "--dataset.repo_id=local/arm"]
+    flags += [
+        f"--dataset.root={recording}",
+        "--steps=3",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--save_checkpoint=false",
+    ]
+    made = {}
+    for kind, first in (("with", ""), ("without", WITHOUT)):
+        script = f"{first}import runpy; runpy.run_path({str(here / 'recorded_training.py')!r}, run_name='__main__')"
+        words = [sys.executable, "-c", script, str(tmp_path / kind), *flags, "--log_freq=1"]
+        done = subprocess.run(
+            [*words, f"--output_dir={tmp_path / f'run_{kind}'}"],
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(here.parent)},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        made[kind] = torch.load(tmp_path / kind)
+    assert len(made["with"]["losses"]) == 3
+    for name in ("losses", "gradients"):
+        assert torch.equal(made["with"][name], made["without"][name]), name

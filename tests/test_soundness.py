@@ -9,6 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import factory
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_policy
 
@@ -109,11 +112,55 @@ def test_time_comes_from_the_metadata_whatever_the_statistics_lack(root):
 
 def test_a_dataset_seen_before_is_not_read_again(root, monkeypatch):
     policy_of(root)
-    monkeypatch.setattr(soundness, "_floats", None)  # reading would fail
+    monkeypatch.setattr(soundness, "_numbers", None)  # reading would fail
     policy_of(root)
     (path,) = (root / "data").glob("*/*.parquet")
     path.touch()  # changed, as far as one can tell
     with pytest.raises(TypeError):
+        policy_of(root)
+
+
+def policy_of_episodes(root, episodes):
+    """The policy that lerobot-train makes with `--dataset.episodes`."""
+    config = TrainPipelineConfig(
+        DatasetConfig("local/maze", root=str(root), episodes=episodes), policy=UniMASKConfig(**SMALL)
+    )
+    dataset = factory.make_dataset(config)
+    return make_policy(config.policy, ds_meta=dataset.meta)
+
+
+def test_an_episode_that_is_not_read_may_hold_what_it_likes(root):
+    """Also in the statistics, which LeRobot's writer takes of all episodes."""
+    whole = policy_of(root)
+    spoil_column(root, "observation.state", frame=437, number=1, value=np.nan)
+    spoil_statistics(root, "observation.state", lambda stats, key: stats[key]["mean"].__setitem__(1, float("nan")))
+    policy = policy_of_episodes(root, [1, 0])
+    (path,) = (root / "data").glob("*/*.parquet")
+    states = np.array(pq.read_table(path).column("observation.state").to_pylist())[:400]
+    np.testing.assert_allclose(policy.statistics.s_mean, states.mean(0), rtol=1e-5)
+    deviations = states.std(0)
+    deviations[deviations == 0] = 1  # the goal's x, which both episodes share, is only shifted
+    np.testing.assert_allclose(policy.statistics.s_std, deviations, rtol=1e-5)
+    assert torch.equal(policy.episode_starts.returns, whole.episode_starts.returns[:2])
+    with pytest.raises(ValueError, match="episode 2, frame 37"):  # what was looked through does not cover others
+        policy_of_episodes(root, [0, 2])
+    with pytest.raises(ValueError, match="episode 2, frame 37"):
+        policy_of(root)
+
+
+def test_what_was_looked_through_covers_its_parts(root, monkeypatch):
+    policy_of(root)
+    monkeypatch.setattr(soundness, "_numbers", None)  # reading would fail
+    policy_of_episodes(root, [1])
+
+
+def test_rows_of_different_lengths_are_named(root):
+    (path,) = (root / "data").glob("*/*.parquet")
+    table = pq.read_table(path)
+    rows = table.column("action").to_pylist()
+    ragged = pa.array([*rows[:-1], rows[-1][:1]], pa.list_(pa.float32()))
+    pq.write_table(table.set_column(table.column_names.index("action"), "action", ragged), path)
+    with pytest.raises(ValueError, match=r"action has rows of different lengths"):
         policy_of(root)
 
 

@@ -21,7 +21,7 @@ def add(commands: Any) -> None:
         help="how the expert counts a bump into a wall: as the paper's text says, or as its authors' code does",
     )
     _camera(doorkey)
-    doorkey.set_defaults(run=_build, settings=("expert", "camera"))
+    doorkey.set_defaults(run=_build, settings=("expert", "camera", "use_videos"))
 
     maze2d = add_command(environments, "maze2d", "a point mass in a maze, a waypoint controller")
     _dataset(maze2d, episodes=1000)
@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
     maze2d.add_argument(
         "--hide_goal", type=boolean, default=False, metavar="true", help="leave the goal out of the state"
     )
-    maze2d.set_defaults(run=_build, settings=("noise", "maze", "camera", "hide_goal"))
+    maze2d.set_defaults(run=_build, settings=("noise", "maze", "camera", "use_videos", "hide_goal"))
 
     metaworld = add_command(environments, "metaworld", "tasks of MetaWorld for a Sawyer arm, scripted experts (extra)")
     _dataset(metaworld, episodes=100)
@@ -54,6 +54,9 @@ def _dataset(parser: argparse.ArgumentParser, *, episodes: int) -> None:
 def _camera(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--camera", type=boolean, default=False, metavar="true", help="add observation.images.top, a video from above"
+    )
+    parser.add_argument(
+        "--use_videos", type=boolean, default=True, metavar="false", help="false: pictures in place of the video"
     )
 
 

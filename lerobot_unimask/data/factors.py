@@ -20,6 +20,7 @@ RETURN_TO_GO = "observation.return_to_go"
 RETURN_SO_FAR = "observation.return_so_far"
 TASK = "task"  # LeRobot's name for what an episode is to do, a text; here the factor that it becomes, too
 
+TEXTS = ("string", "language")  # LeRobot's types of columns that hold no numbers, beside pictures
 MAX_SIZE = 65536  # numbers of a column, categories of a number: more is a damaged file
 MAX_JOINT = 1024  # combinations of categories that one distribution is over; beyond, each number has its own
 LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
@@ -234,7 +235,7 @@ def flat_names(names: Any) -> list[str]:
 
 
 def is_numeric(entry: dict[str, Any]) -> bool:
-    return entry["dtype"] not in ("image", "video", "string", "language") and len(entry["shape"]) <= 1
+    return entry["dtype"] not in ("image", "video", *TEXTS) and len(entry["shape"]) <= 1
 
 
 def read_feature(key: str, entry: dict[str, Any]) -> Feature:
@@ -308,10 +309,13 @@ def group_features(
     if not states:
         raise ValueError(
             f"The dataset has no {STATE!r}: UniMASK models states and actions. It has {list(found)}; "
-            "--policy.states names others."
+            f"`unimask prepare --rename OLD={STATE}` renames a column, --policy.states names others of {OBS_PREFIX}*."
         )
     if ACTION not in found:
-        raise ValueError(f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}.")
+        raise ValueError(
+            f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}; "
+            f"`unimask prepare --rename OLD={ACTION}` renames a column."
+        )
     features = {"s": [found[key] for key in states], "a": [found[ACTION]]}
     if RETURN_TO_GO in found:
         features["rtg"] = [found[RETURN_TO_GO]]

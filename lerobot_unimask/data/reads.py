@@ -26,6 +26,7 @@ from lerobot.datasets.io_utils import hf_transform_to_torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data._utils.collate import collate
 
+from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.frames import cached_frames
 
 
@@ -193,7 +194,8 @@ class ReadsCameras(Protocol):
 
 def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobotDataset | None = None) -> None:
     """From here on the dataset has the cameras that a policy reads, and decodes no others; their frames are cached
-    where the settings say so.
+    where the settings say so. Columns of texts go too, which cannot be read in batches and which no policy of ours
+    reads.
 
     Args:
         whole: dataset with more episodes of the same folder whose frames are cached already.
@@ -201,15 +203,17 @@ def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobot
     Raises:
         ValueError, OSError: what `cached_frames` and `cameras_of` raise.
     """
-    if not dataset.meta.camera_keys:
-        return
-    wanted = settings.cameras_of(dataset.meta.features)
-    hf_dataset = dataset.hf_dataset
+    features = dataset.meta.features
+    wanted = settings.cameras_of(features)
     unread = [key for key in dataset.meta.camera_keys if key not in wanted]
+    unread += [key for key, entry in features.items() if entry["dtype"] in TEXTS]
     for key in unread:
-        del dataset.meta.features[key]
+        del features[key]
         (dataset.reader.delta_indices or {}).pop(key, None)
-    dataset.reader.hf_dataset = hf_dataset.remove_columns([key for key in unread if key in hf_dataset.column_names])
+    if unread:
+        hf_dataset = dataset.hf_dataset
+        stored = [key for key in unread if key in hf_dataset.column_names]
+        dataset.reader.hf_dataset = hf_dataset.remove_columns(stored)
     if not wanted or not settings.cache_frames:
         return
     if whole is not None and whole in _frames:

@@ -75,15 +75,21 @@ class EpisodeStarts(nn.Module):
         return self.returns[torch.cdist(state, self.states).argmin(dim=1)].unsqueeze(-1)
 
 
-def read_starts(root: Path, state_keys: Sequence[str], return_key: str) -> tuple[Tensor, Tensor] | None:
+def read_starts(
+    root: Path, state_keys: Sequence[str], return_key: str, episodes: Sequence[int] | None = None
+) -> tuple[Tensor, Tensor] | None:
     """First states (E, D) and returns (E,) of a LeRobotDataset's episodes; None if its data is not there.
 
-    Note: All its episodes, those too that `--dataset.eval_split` holds out: a policy is not told which these are.
+    Args:
+        episodes: those that are read; None: all. Those that `--dataset.eval_split` holds out are among them.
     """
     if not (root / "data").is_dir():
         return None
     data = pyarrow.dataset.dataset(root / "data", format="parquet")
-    first = data.to_table([*state_keys, return_key], filter=pyarrow.dataset.field("frame_index") == 0)
+    wanted = pyarrow.dataset.field("frame_index") == 0
+    if episodes is not None:
+        wanted &= pyarrow.dataset.field("episode_index").isin(list(episodes))
+    first = data.to_table([*state_keys, return_key], filter=wanted)
     columns = [torch.tensor(np.array(first[key].to_pylist(), dtype=np.float32)) for key in (*state_keys, return_key)]
-    episodes = len(first)
-    return torch.cat([column.view(episodes, -1) for column in columns[:-1]], dim=1), columns[-1].view(episodes)
+    count = len(first)
+    return torch.cat([column.view(count, -1) for column in columns[:-1]], dim=1), columns[-1].view(count)

@@ -19,54 +19,77 @@ from torch import Tensor
 SEEN = HF_LEROBOT_HOME / "unimask" / "sound"  # markers of datasets that have been looked through
 
 
-def check_columns(root: Path, columns: Mapping[str, Sequence[str]]) -> None:
-    """Look through a dataset's columns once; a dataset whose files have not changed since is not read again.
+def check_columns(root: Path, columns: Mapping[str, Sequence[str]], episodes: Sequence[int] | None = None) -> None:
+    """Look through a dataset's columns once; one whose files have not changed since is not read again.
 
     Args:
         root: folder of a LeRobotDataset.
         columns: those to look through -> the names of their numbers.
+        episodes: those that are read; None: all. Others may hold what they like.
 
     Raises:
         ValueError: a number is not finite; names the column, the number, and its episode and frame.
     """
     files = sorted((root / "data").glob("*/*.parquet"))
-    marker = SEEN / _fingerprint(root, files, columns)
-    if not files or marker.exists():
+    markers = [SEEN / _fingerprint(root, files, columns, part) for part in {None, _in_order(episodes)}]
+    if not files or any(marker.exists() for marker in markers):
         return
     for path in files:
-        for key, values in _floats(path, list(columns)):
+        for key, values, rows in _numbers(path, list(columns), episodes):
             bad = ~np.isfinite(values)
             if bad.any():
-                raise ValueError(_describe(path, key, columns[key], bad, values))
+                raise ValueError(_describe(path, key, columns[key], bad, values, rows))
+    marker = SEEN / _fingerprint(root, files, columns, _in_order(episodes))
     with contextlib.suppress(OSError):  # a home that is read-only only costs the next look
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
 
 
-def _fingerprint(root: Path, files: Sequence[Path], columns: Mapping[str, Sequence[str]]) -> str:
+def _in_order(episodes: Sequence[int] | None) -> tuple[int, ...] | None:
+    return None if episodes is None else tuple(sorted(episodes))
+
+
+def _fingerprint(
+    root: Path, files: Sequence[Path], columns: Mapping[str, Sequence[str]], episodes: tuple[int, ...] | None
+) -> str:
     stats = [(str(path.relative_to(root)), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    return hashlib.sha256(json.dumps([str(root.resolve()), stats, sorted(columns)]).encode()).hexdigest()
+    facts = [str(root.resolve()), stats, sorted(columns), *([] if episodes is None else [episodes])]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
-def _floats(path: Path, keys: Sequence[str]) -> Iterator[tuple[str, np.ndarray]]:
-    """Each column of floating-point numbers of a file as (N, D)."""
-    table = pq.read_table(path, columns=[key for key in keys if key in pq.read_schema(path).names], memory_map=True)
-    for key in table.column_names:
+def _numbers(
+    path: Path, keys: Sequence[str], episodes: Sequence[int] | None = None
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Each column of a file, of some episodes, as (N, D), NaN where there is no number, and which rows these are, (N,).
+
+    Raises:
+        ValueError: a column's rows have different lengths.
+    """
+    found = [key for key in keys if key in pq.read_schema(path).names]
+    table = pq.read_table(path, columns=[*found, "episode_index"], memory_map=True)
+    rows: np.ndarray = np.arange(len(table))
+    if episodes is not None:
+        rows = rows[np.isin(table.column("episode_index").to_numpy(), list(episodes))]
+        table = table.take(rows)
+    for key in found if len(table) else ():
         column = table.column(key).combine_chunks()
         while pa.types.is_nested(column.type):
             column = column.flatten()
-        if pa.types.is_floating(column.type) and len(table):
-            yield key, column.to_numpy(zero_copy_only=False).reshape(len(table), -1)
+        if column.null_count:  # NaN, where Arrow would make objects of whole numbers and booleans
+            column = column.cast(pa.float64())
+        if len(column) % len(table):
+            raise ValueError(f"{key} has rows of different lengths, or empty ones, in {path}: mend the data.")
+        yield key, column.to_numpy(zero_copy_only=False).reshape(len(table), -1), rows
 
 
-def _describe(path: Path, key: str, names: Sequence[str], bad: np.ndarray, values: np.ndarray) -> str:
+def _describe(path: Path, key: str, names: Sequence[str], bad: np.ndarray, values: np.ndarray, rows: np.ndarray) -> str:
     row, number = np.argwhere(bad)[0]
-    place = pq.read_table(path, columns=["episode_index", "frame_index"]).slice(int(row), 1).to_pylist()[0]
+    place = pq.read_table(path, columns=["episode_index", "frame_index"]).slice(int(rows[row]), 1).to_pylist()[0]
     name = names[number] if number < len(names) else str(number)
     return (
         f"{key} holds {values[row, number]} for {name!r} in episode {place['episode_index']}, frame "
         f"{place['frame_index']}, and {int(bad.sum()) - 1} more in this file that are not finite: mend the data, or "
-        "take these episodes out with lerobot-edit-dataset, delete_episodes."
+        "leave these episodes out with --dataset.episodes or lerobot-edit-dataset, delete_episodes."
     )
 
 
@@ -94,9 +117,10 @@ def check_statistics(key: str, names: Sequence[str], known: Mapping[str, ArrayLi
             )
 
 
-def compute_statistics(root: Path, key: str) -> dict[str, np.ndarray]:
-    """Mean and standard deviation of a column that the dataset's statistics lack, (D,) each."""
-    parts = [values for path in sorted((root / "data").glob("*/*.parquet")) for _, values in _floats(path, [key])]
+def compute_statistics(root: Path, key: str, episodes: Sequence[int] | None = None) -> dict[str, np.ndarray]:
+    """Mean and standard deviation of a column that the dataset's statistics lack, (D,) each, over some episodes."""
+    files = sorted((root / "data").glob("*/*.parquet"))
+    parts = [values for path in files for _, values, _ in _numbers(path, [key], episodes)]
     if not parts:
         raise ValueError(f"The dataset's statistics lack {key!r}, and it is no column of numbers in {root / 'data'}.")
     values = np.concatenate(parts).astype(np.float64)

@@ -229,11 +229,18 @@ class Statistics(nn.Module):
         self.register_buffer("horizon", torch.tensor(float(context_length)))
         self.register_buffer("fps", torch.tensor(1.0))
 
-    def fill(self, dataset_stats: Mapping[str, Mapping[str, Any]], *, root: Path | None = None) -> None:
+    def fill(
+        self,
+        dataset_stats: Mapping[str, Mapping[str, Any]],
+        *,
+        root: Path | None = None,
+        episodes: Sequence[int] | None = None,
+    ) -> None:
         """Take over a dataset's statistics, as `LeRobotDatasetMetadata.stats` holds them.
 
         Args:
             root: folder of the dataset, from whose columns absent statistics are computed.
+            episodes: those that are read; None: all. Statistics that others have made unsound are computed too.
 
         Raises:
             ValueError: a continuous feature has no mean and standard deviation there, or unsound ones, or a discrete
@@ -247,12 +254,13 @@ class Statistics(nn.Module):
                 start += feature.size
                 known = {key: _numbers(value) for key, value in dataset_stats.get(feature.key, {}).items()}
                 if feature.categories is None:
-                    if not {"mean", "std"} <= known.keys():
+                    spoilt = episodes is not None and not all(value.isfinite().all() for value in known.values())
+                    if spoilt or not {"mean", "std"} <= known.keys():
                         if root is None:
                             raise ValueError(
                                 f"The dataset's statistics lack {feature.key!r}: `unimask prepare` recomputes them."
                             )
-                        computed = compute_statistics(root, feature.key)
+                        computed = compute_statistics(root, feature.key, episodes)
                         known = {kind: _numbers(value) for kind, value in computed.items()}
                     kept = {kind: _numbers(known[kind]) for kind in ("mean", "std")}
                     check_statistics(feature.key, names_of(feature), kept)

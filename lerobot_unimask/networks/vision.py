@@ -102,16 +102,23 @@ class CameraEncoder(nn.Module):
         Returns:
             (B, K, D): a token for each shown picture, 0 elsewhere.
         """
+        if torch.compiler.is_compiling():  # how much is computed must not depend on the masks: all pictures are
+            seen = torch.where(shown[..., None, None, None], pictures, 0).flatten(0, 1)
+            return torch.where(shown[..., None], self._look(seen).unflatten(0, shown.shape), 0.0)
         tokens = self.out.weight.new_zeros(*shown.shape, self.width)
         if not shown.any():
             return tokens
         seen = pictures[shown]  # (N, C, H, W)
         if seen.shape[-2:] != self.size:
             _say_once(tuple(seen.shape[-2:]), self.size)
-            seen = resized(seen, self.size)
-        seen = seen.to(tokens.dtype) / 255 if seen.dtype == torch.uint8 else seen.to(tokens.dtype)
-        keypoints = self.pool(self.backbone(2 * seen - 1)).flatten(1)  # (N, 2 * KEYPOINTS)
-        return tokens.masked_scatter(shown[..., None], self.out(keypoints).to(tokens.dtype))
+        return tokens.masked_scatter(shown[..., None], self._look(seen).to(tokens.dtype))
+
+    def _look(self, pictures: Tensor) -> Tensor:
+        """(N, C, H, W) -> (N, D)."""
+        pictures, dtype = resized(pictures, self.size), self.out.weight.dtype
+        pictures = pictures.to(dtype) / 255 if pictures.dtype == torch.uint8 else pictures.to(dtype)
+        keypoints = self.pool(self.backbone(2 * pictures - 1)).flatten(1)  # (N, 2 * KEYPOINTS)
+        return self.out(keypoints)
 
 
 class CameraEmbedding(nn.Module):
