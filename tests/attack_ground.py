@@ -26,6 +26,8 @@ os.environ.update(HF_ENDPOINT=HUB.endpoint, HF_HOME=str(HOME), HF_TOKEN="token",
 os.environ.update(HF_HUB_OFFLINE="0", HF_HUB_DISABLE_PROGRESS_BARS="1", HF_HUB_DOWNLOAD_TIMEOUT="2")
 
 
+from policies import SMALL  # noqa: E402
+
 import lerobot_policy_unimask  # noqa: E402, F401
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy  # noqa: E402
 from lerobot_unimask.sharing import cards, hub  # noqa: E402
@@ -101,9 +103,6 @@ def push_dataset(root: Path, name: str) -> str:
 def complete(repository, what: str) -> bool:
     wanted = {"model.safetensors", "config.json"} if what == "model" else {"meta/info.json", "meta/stats.json"}
     return {*wanted, "README.md"} <= set(repository.files)
-
-
-SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16}
 
 
 def CONFIG() -> UniMASKConfig:

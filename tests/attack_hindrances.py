@@ -9,13 +9,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import attack_ground as ground
 import commands
 import numpy as np
 from attack_ground import CONFIG, HOME, HUB, Outcome, attempt, complete, duration, forked, push_policy, small_policy
 from lerobot.common.train_utils import update_last_checkpoint
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
+from policies import TRAIN_FLAGS
 
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.prepare import make_plan, prepare
@@ -148,15 +148,8 @@ def killed_studies(count: int, _: Path) -> Iterator[tuple[str, Outcome]]:
 
 
 UPDATES = 5  # of a training here, each with its checkpoint
-TRAIN = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", "--num_workers=0"]
-TRAIN += [f"--policy.{name}={value}" for name, value in ground.SMALL.items()]
-TRAIN += [
-    "--batch_size=4",
-    f"--steps={UPDATES}",
-    "--save_freq=1",
-    "--env_eval_freq=0",
-    "--dataset.repo_id=local/doorkey",
-]
+TRAIN = [*TRAIN_FLAGS, "--num_workers=0", "--batch_size=4", f"--steps={UPDATES}", "--save_freq=1"]
+TRAIN += ["--env_eval_freq=0", "--dataset.repo_id=local/doorkey"]
 
 
 def train(*flags: str) -> None:
@@ -233,6 +226,7 @@ def full_caches(count: int, _: Path) -> Iterator[tuple[str, Outcome]]:
 SESSION = """
 import sys
 from lerobot.scripts import lerobot_train
+from policies import TRAIN_FLAGS
 from lerobot_unimask import cli
 import lerobot_policy_unimask
 words, commands = [], sys.argv[1:]
