@@ -55,7 +55,7 @@ def error_ahead(policy: UniMASKPolicy, batch: dict[str, Tensor], ahead: int) -> 
     Raises:
         ValueError: states that are not continuous, or a window that is too short.
     """
-    if any(component.discrete for component in policy.factors["s"].components):
+    if not policy.factors["s"].continuous:
         raise ValueError("The distance to the true state is measured where states are continuous.")
     now = policy.config.context_length - 1 - ahead
     if now < 1:
@@ -175,10 +175,13 @@ def measure(policy: UniMASKPolicy, dataset: LeRobotDataset, episodes: Sequence[i
     if seen:
         logger.warning("The policy was trained on %d of these %d episodes.", len(seen), len(episodes))
     questions = ["behavior_cloning"] + ["reward_conditioned"] * ("rtg" in policy.factors)
-    if not any(component.discrete for component in policy.factors["a"].components):
+    if policy.factors["a"].continuous:
         record["action_error"] = {question: action_error(policy, batch, question) for question in questions}
-    continuous = not any(component.discrete for component in policy.factors["s"].components)
-    if continuous and policy.config.attention != "causal" and policy.config.context_length >= ahead + 2:
+    if (
+        policy.factors["s"].continuous
+        and policy.config.attention != "causal"
+        and policy.config.context_length >= ahead + 2
+    ):
         record["ahead"] = error_ahead(policy, batch, ahead)
     if policy.config.attention == "both":
         record["disagreement_nats"] = {question: disagreement(policy, batch, question) for question in questions}

@@ -66,8 +66,7 @@ def given_from_episodes(
         if short or values.isnan().any():
             where = f"episode {short[0]}, which is shorter" if short else "this dataset"
             raise ValueError(f"{text.strip()} is not recorded in {where}.")
-        discrete = all(component.discrete for component in factor.components)
-        rows[text.strip()] = (values.long() if discrete else values).tolist()
+        rows[text.strip()] = (values.long() if factor.discrete else values).tolist()
     return rows
 
 

@@ -123,7 +123,7 @@ def validate(
                     {"updates": updates, "losses": losses, "training": training_settings(policy.folder)},
                     policy,
                 )
-                if "forward_dynamics" in masks and all(c.discrete for c in policy.factors["s"].components):
+                if "forward_dynamics" in masks and policy.factors["s"].discrete:
                     truth = probability_of_truth(policy, batch, "forward_dynamics")
                     best["forward_dynamics_probability_of_truth"] = truth
             logger.info("%s: %.4f", path, curve[updates])

@@ -340,7 +340,7 @@ def observed_return(model: ActingModel, batch: Mapping[str, Any], batch_size: in
 
 def as_action(model: Model, action: Tensor) -> Tensor:
     """Category numbers as integers, other actions as they are."""
-    return action.long() if all(component.discrete for component in model.factors["a"].components) else action
+    return action.long() if model.factors["a"].discrete else action
 
 
 def check_settings(config: UniMASKConfig, factors: Mapping[str, Factor]) -> None:

@@ -45,7 +45,7 @@ class HeldOutActions:
             return None
         mine, repeated = (self.missed / self.steps).tolist()
         where = f"On {self.steps} held-out steps"
-        if _is_choice(model):
+        if model.factors["a"].discrete:
             return (
                 f"{where} acting chooses another action than the recorded one in {mine:.1%}, repeating the last action "
                 f"in {repeated:.1%}."
@@ -56,12 +56,8 @@ class HeldOutActions:
         )
 
 
-def _is_choice(model: ActingModel) -> bool:
-    return all(component.discrete for component in model.factors["a"].components)
-
-
 def _missed(model: ActingModel, guessed: Tensor, recorded: Tensor) -> Tensor:
     """The number of (n, D) actions that are not the recorded ones, or the sum of their mean squared distances."""
-    if _is_choice(model):
+    if model.factors["a"].discrete:
         return (guessed != recorded).any(-1).double().sum()
     return ((guessed - recorded) / model.statistics.get_buffer("a_std")).double().square().mean(-1).sum()

@@ -172,6 +172,16 @@ class Factor:
         return self.components[-1].dims.stop
 
     @property
+    def discrete(self) -> bool:
+        """Whether all its numbers are categories."""
+        return all(component.discrete for component in self.components)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether none of its numbers is a category."""
+        return not any(component.discrete for component in self.components)
+
+    @property
     def given_size(self) -> int:
         """The first of the D numbers, which a dataset stores and a user gives."""
         return max(component.dims.stop for component in self.components if not component.computed)
