@@ -2,9 +2,10 @@
 
 The fenced blocks of README.md, then of docs/results.md, marked `bash` and `python` are cases in the order in which they
 stand, named by their line, and run in one folder that holds nothing but a copy of `configs/`; each may need what those
-before it made, so run this file as a whole. A command `uv run X ...` becomes the console script X beside this Python.
-What makes it short is in `SHORT`; nothing else of it is changed. What is not run is in `NOT_RUN`, with the reason; a
-trailing comment with the word hours does the same for one line.
+before it made, so run this file as a whole. Those of docs/results.md take minutes together: they are `slow`, and by
+default what they say to `unimask` is only parsed. A command `uv run X ...` becomes the console script X beside this
+Python. What makes it short is in `SHORT`; nothing else of it is changed. What is not run is in `NOT_RUN`, with the
+reason; a trailing comment with the word hours does the same for one line.
 """
 
 import json
@@ -173,7 +174,11 @@ def namespace() -> dict[str, Any]:
     return {"__name__": "readme"}
 
 
-@pytest.mark.parametrize(("document", "case"), CASES, ids=name)
+@pytest.mark.parametrize(
+    ("document", "case"),
+    [pytest.param(*case, marks=[pytest.mark.slow] * (case[0] == RESULTS)) for case in CASES],
+    ids=name,
+)
 def test_what_the_readme_says_works(
     document: Path, case: Command | Block, folder: Path, namespace: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +190,15 @@ def test_what_the_readme_says_works(
         pytest.skip(case.reason_not_to_run)
     else:
         run(case, folder)
+
+
+@pytest.mark.parametrize(
+    "command", [c for _, c in CASES if isinstance(c, Command) and c.words[:3] == ["uv", "run", "unimask"]], ids=name
+)
+def test_unimask_understands_its_commands(command: Command) -> None:
+    from lerobot_unimask.cli import make_parser
+
+    make_parser().parse_args(command.words[3:])
 
 
 def run(command: Command, folder: Path) -> None:
