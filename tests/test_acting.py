@@ -9,7 +9,7 @@ from lerobot_unimask import MaskError, UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.asking.acting import target_return
 
 
-@pytest.mark.parametrize("K", [1, 4, 20])
+@pytest.mark.parametrize("K", [1, 4])
 @pytest.mark.parametrize("question", ["imitation", "return", "waypoint"])
 def test_acting_is_a_question_asked_at_every_step(kind, layout, question, K, tiny_policy):
     """Every action equals the answer of `infer` about the window that a dataset would have recorded by then."""
