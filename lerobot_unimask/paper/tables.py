@@ -237,6 +237,44 @@ def _scale(record: Record) -> str:
     return markdown_table(heads, rows)
 
 
+def _frames(record: Record) -> str:
+    heads = ("windows a second", "LeRobot, item by item", "batched, from cached frames", "times as many")
+    rate = record["windows_per_second"]
+    off = f"{record['largest_difference_in_grey_levels']:.0f} grey levels"
+    row = (None, f"{rate['lerobot']:.0f}", f"{rate['cached']:,.0f}", f"{record['times_as_many']:.0f}", off)
+    return markdown_table((*heads, "largest difference"), [row])
+
+
+def _attacks(record: Record) -> str:
+    counts = ("tried", "refused", "held", "lost")
+    rows = ((what, *(f"{found[count]:,}" for count in counts)) for what, found in record["attacks"].items())
+    return markdown_table(("attack", *counts), rows)
+
+
+# --- The arm, and how much acting remembers ---------------------------------------------------------------------------
+
+
+def _remembered_success(*records: Record) -> str:
+    ways = {"remembers": "slides", "forgets": "forgets"}
+    steps = sorted({int(h) for record in records for way in ways for h in record[way]})
+
+    def text(found: Mapping[str, float] | None) -> str | None:
+        return f"{100 * found['success']:.0f} ({100 * found['standard_error']:.0f})" if found else None
+
+    rows = (
+        (f"{record['command']['task']}, {name}", *(text(record[way].get(str(h))) for h in steps))
+        for record in records
+        for way, name in ways.items()
+    )
+    return markdown_table(("", *(f"h = {h}" for h in steps)), rows)
+
+
+def _remembered_returns(record: Record) -> str:
+    found = record["remembers"]
+    row = (f"{one['mean_return']:.2f} ({one['standard_error']:.2f})" for one in found.values())
+    return markdown_table([f"h = {h}" for h in found], [list(row)])
+
+
 # --- Which table a head is of ----------------------------------------------------------------------------------------
 
 KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of these records
@@ -253,6 +291,10 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"numbers \| imitation": _encoding,
     r"config \| mean return": _last_checkpoints,
     r"frames \| first batch": _scale,
+    r"windows a second": _frames,
+    r"attack \| tried": _attacks,
+    r"\| h = 1": _remembered_success,
+    r"h = 1": _remembered_returns,
     r"H \| carried out": study_tables.acting_table,
     r"delay \| mask": study_tables.real_time_table,
     r"model \| BC": study_tables.returns_table,
