@@ -293,7 +293,7 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"frames \| first batch": _scale,
     r"windows a second": _frames,
     r"attack \| tried": _attacks,
-    r"\| h = 1": _remembered_success,
+    r"\s*\| h = 1": _remembered_success,
     r"h = 1": _remembered_returns,
     r"H \| carried out": study_tables.acting_table,
     r"delay \| mask": study_tables.real_time_table,
