@@ -10,12 +10,12 @@ from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing
 from dataset_builders.videos import CAMERA, camera_feature
-from dataset_builders.writer import write_dataset
+from dataset_builders.writer import SUCCESS, SUCCESS_FEATURE, write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.doorkey.environment import CAMERA_SHAPE, DoorKeyEnv
 from lerobot_unimask.envs.doorkey.episodes import Episodes, rollout
 from lerobot_unimask.envs.doorkey.expert import Expert
-from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, ENV_ID, FPS, HORIZON, TASK
+from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, ENV_ID, FPS, GOAL, HORIZON, TASK
 
 CHUNK = 10_000  # episodes rolled out at a time
 
@@ -28,19 +28,22 @@ FEATURES: dict[str, dict[str, Any]] = {
     },
     ACTION: {"dtype": "int64", "shape": (1,), "names": ["direction"], "categories": [len(ACTIONS)]},
     "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": ["return_to_go"]},
+    SUCCESS: SUCCESS_FEATURE,
     REWARD: {"dtype": "float32", "shape": (1,), "names": None},
     DONE: {"dtype": "bool", "shape": (1,), "names": None},
 }
 
 
 def frames(episodes: Episodes) -> dict[str, np.ndarray]:
-    """The columns of `FEATURES`, (N, ...), of the steps that are stored: the state after the last action is not."""
+    """The columns of `FEATURES`, (N, ...), of the steps that are stored: the state after the last action is not, and
+    may still be the goal."""
     count, horizon = episodes.action.shape
     rewards = episodes.reward.reshape(-1).astype(np.float32)
     return {
         OBS_STATE: np.stack([episodes.agent[:, :-1], episodes.key[:, :-1]], axis=-1).reshape(-1, 2),
         ACTION: episodes.action.reshape(-1, 1),
         "observation.return_to_go": return_to_go(rewards, np.full(count, horizon))[:, None],
+        SUCCESS: (episodes.agent == GOAL).any(axis=1).astype(np.int64).repeat(horizon)[:, None],
         REWARD: rewards[:, None],
         DONE: np.tile(np.arange(horizon) == horizon - 1, count)[:, None],
     }

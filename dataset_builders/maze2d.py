@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing
 from dataset_builders.videos import CAMERA, camera_feature
-from dataset_builders.writer import write_dataset
+from dataset_builders.writer import SUCCESS, SUCCESS_FEATURE, write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, _clip
@@ -20,6 +20,7 @@ from lerobot_unimask.envs.maze2d.rendering import camera_picture
 FEATURES: dict[str, dict[str, Any]] = {
     "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "goal_x", "goal_y"]},
     "observation.return_to_go": {"dtype": "float32", "shape": (1,), "names": ["return_to_go"]},
+    SUCCESS: SUCCESS_FEATURE,
     "action": {"dtype": "float32", "shape": (2,), "names": ["force_x", "force_y"]},
     "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
     "next.done": {"dtype": "bool", "shape": (1,), "names": None},
@@ -34,14 +35,16 @@ def collect_episodes(
     Episode i depends only on (seed, i, maze, noise), and its start and goal not on the noise.
 
     Returns:
-        The columns (N, ...) `observation.state`, `action` (as the environment received it), `next.reward` and
-        `next.done`; and each episode's initial velocity, float32 (episodes, 2), which the state hides.
+        The columns (N, ...) `observation.state`, `action` (as the environment received it), `observation.success`,
+        `next.reward` and `next.done`; and each episode's initial velocity, float32 (episodes, 2), which the state
+        hides.
     """
     env = Maze2DEnv(maze)
     frames = episodes * HORIZON
     states = np.empty((frames, 4), np.float32)
     actions = np.empty((frames, 2), np.float32)
     rewards = np.empty((frames, 1), np.float32)
+    success = np.empty((frames, 1), np.int64)
     initial_velocities = np.empty((episodes, 2), np.float32)
     frame = 0
     bar = tqdm(range(episodes), desc="Rolling out Maze2D", unit="episode", disable=None if progress else True)
@@ -56,13 +59,14 @@ def collect_episodes(
             states[frame] = observation["agent_pos"]
             action = actions[frame]
             action[0], action[1] = _clip(action_x + noise_x), _clip(action_y + noise_y)
-            observation, reward, _, _, _ = env.step(action)
+            observation, reward, _, _, info = env.step(action)
             rewards[frame] = reward
             frame += 1
+        success[frame - HORIZON : frame] = info["is_success"]
     done = np.zeros((frames, 1), bool)
     done[HORIZON - 1 :: HORIZON] = True
-    columns = {"observation.state": states, "action": actions, "next.reward": rewards, "next.done": done}
-    return columns, initial_velocities
+    columns: dict[str, np.ndarray] = {"observation.state": states, "action": actions, SUCCESS: success}
+    return {**columns, "next.reward": rewards, "next.done": done}, initial_velocities
 
 
 def build_maze2d(

@@ -8,7 +8,7 @@ from lerobot.utils.constants import ACTION, DONE, OBS_ENV_STATE, OBS_STATE, REWA
 from tqdm import tqdm
 
 from dataset_builders.folders import refuse_existing
-from dataset_builders.writer import write_dataset
+from dataset_builders.writer import SUCCESS, SUCCESS_FEATURE, write_dataset
 from lerobot_unimask.envs.metaworld.environment import ENV_ID, FPS, HAND, MetaWorldEnv
 from lerobot_unimask.envs.metaworld.expert import Demonstration, demonstrate, make_expert
 from lerobot_unimask.envs.metaworld.record import HAND_NAMES
@@ -62,6 +62,7 @@ def build_metaworld(
         OBS_STATE: {"dtype": "float32", "shape": (HAND,), "names": list(HAND_NAMES)},
         OBS_ENV_STATE: {"dtype": "float32", "shape": (len(places),), "names": places},
         ACTION: {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "grip"]},
+        SUCCESS: SUCCESS_FEATURE,
         REWARD: {"dtype": "float32", "shape": (1,), "names": None},
         DONE: {"dtype": "bool", "shape": (1,), "names": None},
     }
@@ -69,6 +70,7 @@ def build_metaworld(
         OBS_STATE: np.concatenate([one.hand for one in found]),
         OBS_ENV_STATE: np.concatenate([one.environment for one in found]),
         ACTION: np.concatenate([one.action for one in found]),
+        SUCCESS: np.ones((lengths.sum(), 1), np.int64),  # the others are left out
         REWARD: np.concatenate([one.reward for one in found])[:, None],
         DONE: np.isin(np.arange(lengths.sum()), lengths.cumsum() - 1)[:, None],
     }

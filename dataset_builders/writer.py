@@ -31,6 +31,8 @@ from dataset_builders.folders import refuse_existing, written_whole
 from dataset_builders.videos import encode_pictures, write_videos
 
 PROVENANCE_PATH = "meta/provenance.json"
+SUCCESS = "observation.success"  # of an episode; a property, where --policy.properties names it
+SUCCESS_FEATURE = {"dtype": "int64", "shape": (1,), "names": ["success"], "categories": [2]}
 # LeRobot writes a row group per episode. That is costly when they are short: 20,000 of ten steps take 48 MB and 15 s to
 # load, against 5 MB and 1 s this way.
 ROW_GROUP_FRAMES = 16_384

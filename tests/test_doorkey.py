@@ -390,6 +390,7 @@ def test_frames_are_the_episodes_steps():
             assert columns["action"][row] == episodes.action[episode, now]
             assert columns["next.reward"][row] == episodes.reward[episode, now]
             assert columns["observation.return_to_go"][row] == episodes.reward[episode, now:].sum()
+            assert columns["observation.success"][row] == (GOAL in episodes.agent[episode])
             assert columns["next.done"][row] == (now == HORIZON - 1)
 
 

@@ -407,8 +407,9 @@ def test_a_stored_episode_can_be_replayed(built):
         observation, _ = env.reset(options={"position": (x, y), "velocity": velocity, "goal": goal})
         for state, action, expected in zip(states, actions, rewards, strict=True):
             np.testing.assert_array_equal(observation["agent_pos"], state)  # 1e-5 would do; starts are stored exactly
-            observation, reward, *_ = env.step(action)
+            observation, reward, _, _, info = env.step(action)
             assert np.float32(reward) == expected
+        assert (frames["observation.success"][steps] == info["is_success"]).all()
     assert len(provenance["initial_velocity"]) == 6
 
 

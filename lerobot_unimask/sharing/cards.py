@@ -249,6 +249,7 @@ class Described:
 
 COLUMNS = {
     "observation.return_to_go": "the sum of rewards from this step to the episode's end",
+    "observation.success": "whether the episode reaches what it is to",
     "next.reward": "the reward of this step",
     "next.done": "whether this step is the episode's last",
     "timestamp": "seconds since the episode's start",
