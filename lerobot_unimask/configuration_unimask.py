@@ -4,7 +4,6 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Sequence
-from copy import copy
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -71,7 +70,7 @@ class FormatVersion(int):
     fields that a newer format has and this code does not know."""
 
 
-FORMAT_VERSION = FormatVersion(3)  # of a checkpoint's files; it grows when older code would misread them
+FORMAT_VERSION = FormatVersion(4)  # of a checkpoint's files; it grows when older code would misread them
 
 
 @decode.register(FormatVersion)
@@ -152,6 +151,8 @@ class UniMASKConfig(PreTrainedConfig):
     state_residuals: bool = True
     """Whether continuous states are predicted as departures from the straight course of those shown; False: as plain
     values, the paper's."""
+    ask_properties: bool | None = None
+    """Whether the return and properties are predicted too: rtg[0] | s[:t+1]. None: yes, but for attention=causal."""
     discrete_head: str | None = None
     """What is predicted of a token's discrete numbers: "joint", one distribution over all combinations of their
     categories, where there are at most 1,024, or "separate", the paper's: one for each number. None: joint; in a
@@ -183,7 +184,7 @@ class UniMASKConfig(PreTrainedConfig):
 
     # The loss
     loss_weights: dict[str, float] = field(default_factory=dict)
-    """Weight of each factor's loss, {"s": 0.5}; 1 where not named."""
+    """Weight of each factor's loss, {"s": 0.5}; where not named 1, of properties 1 / context_length."""
 
     # The optimiser's preset
     optimizer_lr: float = 1e-3
@@ -248,6 +249,8 @@ class UniMASKConfig(PreTrainedConfig):
             self.attention = NETWORKS[self.network][0]
         if self.discrete_head is None:
             self.discrete_head = "joint" if self.format_version > 2 else "separate"
+        if self.ask_properties is None:
+            self.ask_properties = self.format_version > 3 and self.attention != "causal"
         self.format_version = FORMAT_VERSION
         for name, choices in {
             "attention": NETWORKS[self.network],
@@ -285,7 +288,7 @@ class UniMASKConfig(PreTrainedConfig):
         if isinstance(self.target_return, float) and not math.isfinite(self.target_return):
             raise ValueError(f"target_return is {self.target_return}; give a finite number or auto.")
         for name, weight in self.loss_weights.items():
-            if name not in ASKABLE:
+            if name not in ASKABLE and not self.ask_properties:
                 raise ValueError(f"loss_weights names {name}; only {' and '.join(ASKABLE)} are predicted.")
             if not 0 <= weight < float("inf"):
                 raise ValueError(f"loss_weights gives {name} the weight {weight}; weights are numbers from 0 on.")
@@ -294,6 +297,11 @@ class UniMASKConfig(PreTrainedConfig):
             if text != RANDOM_MASK:
                 parse(text)
         parse(self.inference_mask)
+
+    def predicted(self, factors: Iterable[str]) -> tuple[str, ...]:
+        """Those of the model's factors that it can be asked for: states and actions, and then properties."""
+        properties = [name for name in factors if name not in (*ASKABLE, *self.pictures)]
+        return (*ASKABLE, *properties) if self.ask_properties else ASKABLE
 
     def make_factors(self) -> dict[str, Factor]:
         """The model's factors, and how the heads predict them."""
@@ -330,7 +338,7 @@ class UniMASKConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, dataset_features: dict[str, dict[str, Any]]) -> None:
-        """Read the factors off a dataset's features; LeRobot calls this only in training.
+        """Read the factors off a dataset's features; LeRobot calls this only in training. Properties may be new.
 
         Raises:
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
@@ -341,7 +349,9 @@ class UniMASKConfig(PreTrainedConfig):
         pictures = self._named_cameras(dataset_features, features)
         tasks = {name: columns for name, columns in self.features.items() if name == TASK}  # not among the columns
         features |= tasks
-        if self.features and (features, pictures) != (self.features, self.pictures):
+        added = {key.rpartition(".")[-1] for key in self.properties} - self.features.keys()
+        known = {name: columns for name, columns in features.items() if name not in added}
+        if self.features and (known, pictures) != (self.features, self.pictures):
             raise ValueError(
                 "This checkpoint was trained on other features than the dataset has.\n"
                 f"  checkpoint: {describe_features(self.features, self.pictures)}\n"
@@ -407,7 +417,7 @@ def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
     content = {name: value for name, value in content.items() if name != "causal_draw"}
     content["n_obs_steps"] = None  # LeRobot's own default, 1, stands in all of them, and nothing read it
     content["state_residuals"] = content.get("fine_inputs", True)
-    content["discrete_head"] = "separate"
+    content |= {"discrete_head": "separate", "ask_properties": False}
     content["format_version"] = int(FORMAT_VERSION)
     if content.get("network") == "decision_gpt":
         content |= {"network": "transformer", "attention": "causal", "token_layout": "separate"}
@@ -438,13 +448,3 @@ def read_config(folder: Path) -> UniMASKConfig:
         hidden = isinstance(error, ParsingError) and not isinstance(error, DecodingError)
         reason = error.__cause__ if hidden else error
         raise ValueError(f"{path} cannot be read: {str(reason)[:1000]}") from error
-
-
-def saved_factors(config: UniMASKConfig, folder: Path) -> dict[str, Factor]:
-    """The factors as a checkpoint's own heads predict them: the config that it is read with may say joint where it has
-    separate ones, or a mixture where it has Gaussians."""
-    saved, own = copy(config), read_config(folder)
-    saved.discrete_head = own.discrete_head
-    if (own.continuous_head, config.continuous_head) == ("gaussian", "mixture"):
-        saved.continuous_head = "gaussian"
-    return saved.make_factors()

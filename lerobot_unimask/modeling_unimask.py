@@ -25,7 +25,7 @@ from lerobot_unimask.asking.memory import RolloutMemory
 from lerobot_unimask.asking.predicting import predict, without_dropout
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
-from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config, saved_factors
+from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config
 from lerobot_unimask.data.checkpoints import WEIGHTS, check_header, check_weights, read_weights
 from lerobot_unimask.data.factors import TASK
 from lerobot_unimask.data.returns import EpisodeStarts
@@ -36,7 +36,8 @@ from lerobot_unimask.language.masks import Mask
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
 from lerobot_unimask.machine import keep_freed_memory, wait_without_spinning
 from lerobot_unimask.networks import make_network
-from lerobot_unimask.networks.layers import Cache, Predictions, joined
+from lerobot_unimask.networks.growing import fitted, saved_config
+from lerobot_unimask.networks.layers import Cache, Predictions
 from lerobot_unimask.networks.losses import LossParts
 from lerobot_unimask.networks.vision import parameter_groups
 from lerobot_unimask.objective import CapturedLoss, batch_loss
@@ -92,6 +93,7 @@ class UniMASKPolicy(PreTrainedPolicy):
             config.context_length,
             causal_share=config.causal_share if config.attention == "both" else float(config.attention == "causal"),
             cameras=tuple(self.cameras),
+            predicted=config.predicted(self.factors),
         )
         self.network = make_network(config, self.factors, load_backbone=load_backbone)
         self._batch_loss = CapturedLoss() if config.compile_model else batch_loss
@@ -354,7 +356,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         config = config or read_config(folder)
         config.validate_features()
         with torch.device("meta"):
-            network = make_network(config, saved_factors(config, folder), load_backbone=False)
+            saved = saved_config(config, folder)
+            network = make_network(saved, saved.make_factors(), load_backbone=False)
         check_header(folder / WEIGHTS, network.state_dict(prefix="network."))
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints where the weights come from
             policy = super().from_pretrained(folder, config=config, **kwargs)
@@ -426,11 +429,12 @@ class UniMASKPolicy(PreTrainedPolicy):
         cls, model: "UniMASKPolicy", model_file: str, map_location: str, strict: bool
     ) -> "UniMASKPolicy":
         """Strictly, whatever `strict` says: LeRobot never passes it, and a partly loaded model answers nonsense.
-        Separate heads become joint ones where the config says so."""
+        Separate heads become joint ones where the config says so, and what it asks for besides begins as drawn."""
         weights = read_weights(Path(model_file))
         if weights.get("episode_starts.returns", torch.empty(())).ndim == 1:
             model.episode_starts.make_room(len(weights["episode_starts.returns"]))
-        weights |= joined(weights, saved_factors(model.config, Path(model_file).parent), model.factors)
+        saved = saved_config(model.config, Path(model_file).parent)
+        weights = fitted(weights, saved, model.config, model.state_dict())
         check_weights(weights, model.state_dict(), model_file)
         model.load_state_dict(weights)
         return model

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_unimask.data.window import Window
+from lerobot_unimask.language.masks import ASKABLE
 from lerobot_unimask.networks.losses import masked_losses
 
 Losses = tuple[Tensor, dict[str, Tensor]]  # the loss, and each factor's part in it
@@ -27,7 +28,9 @@ def batch_loss(policy: Any, window: Window, index: Tensor, step: Tensor | int, r
     window = policy.statistics.normalise(window)
     predictions = policy.network(window, mask.shown, mask.causal, asked=mask.asked)
     losses = masked_losses(predictions, window, mask.asked, policy.factors, reduction=reduction)
-    return sum(policy.config.loss_weights.get(name, 1.0) * part for name, part in losses.items()), losses
+    config = policy.config
+    each = {name: 1.0 if name in ASKABLE else 1 / config.context_length for name in losses} | config.loss_weights
+    return sum(each[name] * part for name, part in losses.items()), losses
 
 
 class CapturedLoss:

@@ -188,30 +188,31 @@ def make_check(policy: UniMASKPolicy, name: str, start: int = 0) -> Check:
 def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
     """The answer token by token in the order of time, one row for each number of a token.
 
-    Marginals have `most_likely`, its `probability` and all `probabilities`, or `mean` and `scale` (None from an L2
-    head), and of a mixture the `weights`, `means` and `scales` of its Gaussians; samples `most_frequent`, its `share`
-    and all `shares`, or `mean` and `scale` over the samples. `recorded` is None where nothing is. `exact` has the
-    optimum's marginal, where that was asked for.
+    Marginals have `most_likely`, its `probability` and all `probabilities`, and where categories are texts its `label`;
+    or `mean` and `scale` (None from an L2 head), and of a mixture the `weights`, `means` and `scales` of its Gaussians;
+    samples `most_frequent`, its `share` and all `shares`, or `mean` and `scale` over the samples. `recorded` is None
+    where nothing is. `exact` has the optimum's marginal, where that was asked for.
     """
     K = policy.config.context_length
     table = []
     for step in range(K):
-        for name in ASKABLE:
+        for name in policy.factors:
             if not reply.mask.asked[name][0, step]:
                 continue
-            for component in policy.factors[name].components:
+            for component in [c for c in policy.factors[name].components if not c.computed]:
                 for i in range(component.dims.start, component.dims.stop):
-                    recorded = None
-                    if reply.recorded is not None and not math.isnan(reply.recorded.values[name][0, step, i]):
-                        recorded = _number(reply.recorded.values[name][0, step, i], component.discrete)
+                    value = math.nan if reply.recorded is None else reply.recorded.values[name][0, step, i].item()
+                    recorded = None if math.isnan(value) else int(value) if component.discrete else value
                     if isinstance(reply.answer, Samples):
                         said = _of_samples(reply.answer.values[name][:, step, i], component.categories)
                     else:
                         said = _of_marginals(reply.answer, name, step, i)
                     label = policy.number_names[name][i]
                     row = {"token": f"{name}[{step}]", "step": step, "factor": name, "component": label}
-                    best = {} if reply.exact is None else {"exact": _of_marginals(reply.exact, name, step, i)}
-                    table.append({**row, **said, **best, "recorded": recorded})
+                    if component.labels:
+                        said["label"] = component.labels[said.get("most_likely", said.get("most_frequent", 0))]
+                    exact = {} if reply.exact is None else {"exact": _of_marginals(reply.exact, name, step, i)}
+                    table.append({**row, **said, **exact, "recorded": recorded})
     return table
 
 
@@ -236,10 +237,6 @@ def _of_samples(values: Tensor, categories: int | None) -> dict[str, Any]:
     shares = values.long().bincount(minlength=categories) / len(values)
     best = int(shares.argmax())
     return {"most_frequent": best, "share": shares[best].item(), "shares": shares.tolist()}
-
-
-def _number(value: Tensor, discrete: bool) -> int | float:
-    return int(value) if discrete else value.item()
 
 
 def record(
@@ -271,7 +268,8 @@ def record(
     }
     if sampling is not None and isinstance(reply.answer, Samples):
         counts = {name: getattr(reply.answer, name) for name in ("drawn", "rejected", "restarted", "acceptance")}
-        values = {name: _plain(reply.answer.values[name].tolist()) for name in ASKABLE}
+        drawn = [name for name in policy.factors if name in ASKABLE or reply.mask.asked[name].any()]
+        values = {name: _plain(reply.answer.values[name].tolist()) for name in drawn}
         result["sampling"] = {**vars(sampling), **counts, "values": values}
     return result
 
@@ -310,7 +308,7 @@ def _cells(answers: Sequence[Mapping[str, Any]], sampled: bool) -> Iterator[list
     value, weight = ("most frequent", "share") if sampled else ("most likely", "probability")
     heads = [value if discrete else "", "mean" if continuous else ""]
     weights = [weight if discrete else "", "scale" if continuous else ""]
-    best = ["exact", "probability"] if "exact" in answers[0] else []
+    best = ["exact", " / ".join(filter(None, weights))] if "exact" in answers[0] else []
     yield [
         "step",
         "factor",
@@ -325,8 +323,12 @@ def _cells(answers: Sequence[Mapping[str, Any]], sampled: bool) -> Iterator[list
         if "mean" in row:
             said = [f"{row['mean']:.4g}", "" if row["scale"] is None else f"± {row['scale']:.3g}"]
         else:
-            said = [str(row[value.replace(" ", "_")]), f"{row[weight]:.3f}"]
-        best = [str(row["exact"]["most_likely"]), f"{row['exact']['probability']:.3f}"] if "exact" in row else []
+            said = [row.get("label") or str(row[value.replace(" ", "_")]), f"{row[weight]:.3f}"]
+        exact, best = row.get("exact", {}), []
+        if "probability" in exact:
+            best = [str(exact["most_likely"]), f"{exact['probability']:.3f}"]
+        elif exact:
+            best = [f"{exact['mean']:.4g}", f"± {exact['scale']:.3g}"]
         yield [str(row["step"]), row["factor"], row["component"], *said, *best, recorded]
 
 
@@ -370,6 +372,7 @@ def overview(policy: UniMASKPolicy) -> dict[str, Any]:
         "attention": policy.config.attention,
         "training_masks": policy.training_masks.weights,
         "factors": factors,
+        "predicted": policy.config.predicted(policy.factors),
         "cameras": {name: {"column": camera.key, "shape": camera.shape} for name, camera in policy.cameras.items()},
         "tasks": tasks,
     }
@@ -383,7 +386,8 @@ def describe_overview(result: Mapping[str, Any]) -> str:
     lines += ["", "Factors, with the dataset's units:"]
     width_of = max(map(len, (*result["factors"], *result["cameras"])))
     for name, components in result["factors"].items():
-        where = "" if name in ASKABLE else f"; shown as {name}[0] or not at all"
+        how = "shown or asked" if name in result["predicted"] else "shown"
+        where = "" if name in ASKABLE else f"; {how} as {name}[0]"
         for part in components:
             kind = (
                 f"category 0 to {part['categories'] - 1}"
@@ -437,5 +441,9 @@ def _picture_of_answer(policy: UniMASKPolicy, mask: str, reply: Reply, source: S
 
 def _known(window: Window, mask: Mask) -> Window:
     """The window with NaN where nothing was asked."""
-    values = {name: torch.where(mask.asked[name].unsqueeze(-1), window.values[name], torch.nan) for name in ASKABLE}
+    values = {
+        name: torch.where(tokens.unsqueeze(-1), window.values[name], torch.nan)
+        for name, tokens in mask.asked.items()
+        if name in ASKABLE or tokens.any()
+    }
     return Window(values, window.valid)

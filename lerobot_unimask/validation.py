@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from lerobot_unimask.asking.answers import DiscreteDistribution
+from lerobot_unimask.asking.foresight import QUESTION, foretold
 from lerobot_unimask.data.checkpoints import checkpoints_of, episodes_trained_on, training_settings
 from lerobot_unimask.data.episodes import first_windows, open_dataset, provenance_of
 from lerobot_unimask.envs import environment_of_states
 from lerobot_unimask.envs.record import optimum_of
 from lerobot_unimask.language.grammar import MaskError
-from lerobot_unimask.language.masks import RANDOM_MASK, TASKS
+from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK, TASKS
 from lerobot_unimask.language.training_masks import validation_masks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.losses import masked_losses
@@ -50,8 +51,19 @@ def task_losses(policy: UniMASKPolicy, batch: dict[str, Tensor], masks: Iterable
         mask = validation_masks(text, tuple(policy.factors), window.valid, batch["index"], tuple(policy.cameras))
         predictions = policy.predict(normalised, mask)
         parts = masked_losses(predictions, normalised, mask.asked, policy.factors, apart=True)
-        losses[text] = sum(part.item() for part in parts.values())
+        losses[text] = sum(parts[name].item() for name in ASKABLE)
     return losses
+
+
+def foretold_properties(policy: UniMASKPolicy, batch: dict[str, Tensor]) -> dict[str, list[dict[str, Any]]]:
+    """The return and each property of one number, where the policy predicts them: how well, see `foretold`."""
+    window = policy.make_window(batch)
+    names = [name for name in policy.config.predicted(policy.factors) if name not in ASKABLE]
+    return {
+        name: foretold(policy.infer, window, name, tuple(policy.cameras))
+        for name in names
+        if policy.factors[name].given_size == 1
+    }
 
 
 @torch.no_grad()
@@ -130,7 +142,8 @@ def validate(
         chosen.append(best_policy)
         count = len(batch["index"])
         seen = len(episodes_trained_on(best_policy.folder, Path(dataset.root), repo_id, count))
-        results.append({**best, "trained_on_episodes": seen, "random_mask_loss_by_updates": curve})
+        best |= {"trained_on_episodes": seen, "random_mask_loss_by_updates": curve}
+        results.append({**best, "foretold": foretold_properties(best_policy, batch)})
         if seen:
             logger.warning(
                 "%s was trained on %d of these %d episodes: these losses are not those of unseen ones.",
@@ -149,7 +162,8 @@ def validate(
             result.update(distance)
     return {
         "what": "validation loss per task; one window from each episode's first step, t uniform",
-        "units": "losses, mean, spread, optimum and what lies above it: nats; probabilities: 0 to 1",
+        "units": "losses, mean, spread, optimum and what lies above it: nats; probabilities: 0 to 1; foretold: errors "
+        "in the dataset's units",
         "validation_episodes": len(batch["index"]),
         "validation_data": provenance,
         "mean": {task: sum(numbers) / len(numbers) for task, numbers in values.items()},
@@ -161,7 +175,7 @@ def validate(
 
 
 def summary(record: dict[str, Any]) -> str:
-    """A record of `validate` for people, a line for each task."""
+    """A record of `validate` for people, a line for each task, and for each time that a property is foretold."""
     width = max(map(len, record["mean"]))
     lines = []
     for task, loss in record["mean"].items():
@@ -170,4 +184,15 @@ def summary(record: dict[str, Any]) -> str:
             best, expected = (record["optimum"][kind][task] for kind in ("losses", "expected_losses"))
             line += f"  optimum {best:.4f}, expected {expected:.4f}"
         lines.append(line)
+    optimum = record.get("optimum", {}).get("foretold", {})
+    for run in record["runs"]:
+        for name, asked in run["foretold"].items():
+            best = optimum.get(name, [{}] * len(asked))
+            for said, exact in zip(asked, best, strict=True):
+                parts = [
+                    f"{what.replace('_', ' ')} {said[what]:.4f}" + f" (optimum {exact[what]:.4f})" * (what in exact)
+                    for what in ("mean_absolute_error", "error", "log_loss", "calibration_error")
+                    if what in said
+                ]
+                lines.append(f"{QUESTION.format(name=name)}, t={said['t']}: {', '.join(parts)}")
     return "\n".join(lines)

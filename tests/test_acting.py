@@ -5,7 +5,7 @@ import torch
 from lerobot.policies.factory import make_policy
 from policies import CONTINUOUS_FEATURES, LAYOUTS, Episode, roll
 
-from lerobot_unimask import MaskError, UniMASKConfig, UniMASKPolicy
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.asking.acting import target_return
 
 
@@ -291,7 +291,7 @@ WITH_CORNER = {
 }
 
 
-def test_a_property_is_read_from_the_batch_and_never_predicted(tiny_policy, continuous_batch):
+def test_a_property_is_read_from_the_batch_shown_and_asked(tiny_policy, continuous_batch):
     policy = tiny_policy("continuous", features=WITH_CORNER, properties=["observation.corner"])
     corner = torch.tensor([0, 1, 0, 1, 1])
     batch = continuous_batch | {"observation.corner": corner[:, None].expand(-1, 10)}
@@ -299,13 +299,14 @@ def test_a_property_is_read_from_the_batch_and_never_predicted(tiny_policy, cont
     assert torch.equal(policy.make_window(batch).values["corner"][:, 0, 0], corner.float())
     loss, parts = policy.train().forward(batch)
     loss.backward()
-    assert parts.keys() == {"loss_s", "loss_a"}
+    assert parts.keys() == {"loss_s", "loss_a", "loss_rtg", "loss_corner"}
     policy.eval()
     asked = policy.infer(batch, "a[1] | s[0], corner[0]").most_likely("a")[:, 1]
     turned = policy.infer(batch, "a[1] | s[0], corner[0]", given={"corner[0]": (1 - corner)[:, None]})
     assert not torch.allclose(asked, turned.most_likely("a")[:, 1])
-    with pytest.raises(MaskError, match="can be shown but never asked"):
-        policy.infer(batch, "corner[0] | s[0]")
+    said = policy.infer(batch, "corner[0] | s[0], rtg[0]")["corner"][0].probabilities  # (5, 10, 2)
+    torch.testing.assert_close(said[:, 0].sum(-1), torch.ones(5))
+    assert said[:, 1:].isnan().all()
 
 
 @pytest.mark.parametrize("K", [3, 10])

@@ -185,7 +185,7 @@ FAULTS = [
     ("^s[20:] | s[0]", "Nothing is asked"),
     ("^a[:t] | a[:t+1]", "Nothing is asked that is not shown for any t"),
     ("^a[t+10] | s[0]", "Nothing is asked"),
-    ("s[1], ^rtg[0] | s[0]", "never asked"),
+    ("s[1], ^rtg[1] | s[0]", "step 0 only"),
     ("a[t] | s[t], ^rtg[1]", "step 0 only"),
     ("a[t] | s[t], ^rtg[t]", "step 0 only"),
     ("a[t] | s[t], ^rtg[:]", "step 0 only"),

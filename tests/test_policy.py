@@ -68,7 +68,7 @@ def test_make_policy_reads_a_datasets_metadata(doorkey, doorkey_batch):
     policy.train()
     loss, parts = policy.forward(preprocessor(doorkey_batch))
     assert_unchanged(doorkey_batch, before)
-    assert loss.item() == pytest.approx(parts["loss_s"] + parts["loss_a"], rel=1e-5)
+    assert loss.item() == pytest.approx(parts["loss_s"] + parts["loss_a"] + parts["loss_rtg"] / 10, rel=1e-5)
     assert all(type(part) is float for part in parts.values())
     loss.backward()
     for name, parameter in policy.named_parameters():
@@ -141,7 +141,8 @@ def test_validation_masks_are_the_same_at_every_update(tiny_policy, doorkey_batc
 
 def test_the_loss_is_the_weighted_sum_of_its_parts(tiny_policy, doorkey_batch):
     loss, parts = tiny_policy(loss_weights={"s": 0.25}).forward(doorkey_batch)
-    assert loss.item() == pytest.approx(0.25 * parts["loss_s"] + parts["loss_a"], rel=1e-5)
+    expected = 0.25 * parts["loss_s"] + parts["loss_a"] + parts["loss_rtg"] / 10
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
 
 
 class OnOneDevice(TorchDispatchMode):
@@ -169,7 +170,7 @@ def test_between_batch_and_gradient_nothing_crosses_between_host_and_device(
     with OnOneDevice("meta"):
         loss, parts = policy(batch)
         loss.backward()
-    assert set(parts) == {"loss_s", "loss_a"}
+    assert set(parts) == {"loss_s", "loss_a", "loss_rtg"}
     with pytest.raises(RuntimeError, match="meta"), OnOneDevice("meta"):  # what the test is made to find
         loss.item()
 

@@ -12,6 +12,7 @@ import torch
 from lerobot_unimask import TASKS, UniMASKPolicy, cli
 from lerobot_unimask.envs.doorkey.comparison import beside_optimum
 from lerobot_unimask.envs.doorkey.episodes import rollout
+from lerobot_unimask.envs.doorkey.rules import GOAL
 from lerobot_unimask.evaluating import rollout as evaluate
 from lerobot_unimask.pretrained import FOLDERS
 
@@ -70,6 +71,7 @@ def test_doorkeys_answers_are_near_the_optimum():
         "observation.state": torch.from_numpy(np.stack([played.agent, played.key], axis=-1)[:, :10]),
         "action": torch.from_numpy(played.action),
         "observation.return_to_go": returns.float(),
+        "observation.success": torch.from_numpy((played.agent == GOAL).any(1)).long()[:, None].expand(-1, 10),
         "index": torch.arange(200) * 10,
         "timestamp": torch.zeros(200),
     }

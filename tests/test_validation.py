@@ -206,6 +206,8 @@ def test_the_optimum_stands_beside_the_runs(runs, record) -> None:
         for task in ALL:
             assert result["divergence"][task] > 0
             assert result["above_optimum"][task] == result["losses"][task] - optimum["losses"][task] > 0
+        for said, best in zip(result["foretold"]["rtg"], optimum["foretold"]["rtg"], strict=True):
+            assert said["mean_absolute_error"] > best["mean_absolute_error"]
         for kind in ("agent_cell", "key_cell", "direction"):
             assert result["random_mask_divergence"][kind]["all"] > 0
     with pytest.raises(ValueError, match="expert 'paper': their optimum is not 'released'"):

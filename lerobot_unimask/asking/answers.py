@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from lerobot_unimask.data.factors import Component, Factor, Output
 from lerobot_unimask.data.window import Statistics, Window
-from lerobot_unimask.language.masks import Mask
+from lerobot_unimask.language.masks import ASKABLE, Mask
 from lerobot_unimask.networks.layers import Cache, Predictions
 
 
@@ -152,6 +152,14 @@ class ContinuousDistribution:
         logs = -(surprise.square() / 2 + math.log(2 * math.pi) / 2 + scales.log().unsqueeze(-3)).sum(-1)
         return logs + self.weights.log().unsqueeze(-2)
 
+    def cumulative(self, values: Tensor) -> Tensor:
+        """The probability that the first number lies below, in the dataset's units: (B, K, n) -> (B, K, n)."""
+        if self.scales is None:
+            raise ValueError("An L2 head's answers have no density.")
+        mean, scale = self.means[..., 0], self.scales[..., 0].clamp_min(1e-12)  # (B, K, m)
+        below = torch.special.ndtr((values.unsqueeze(-1) - mean.unsqueeze(-2)) / scale.unsqueeze(-2))
+        return (below * self.weights.unsqueeze(-2)).sum(-1)
+
     def log_density(self, values: Tensor) -> Tensor:
         """That of the values of tokens, in nats and the dataset's units: (B, K, D) -> (B, K)."""
         return self._log_densities(values[..., self.output.dims].unsqueeze(-2)).logsumexp(-1)[..., 0]
@@ -192,20 +200,22 @@ class Answer:
     """What a policy answers to one mask: `answer["a"][0].probabilities` is (B, K, categories).
 
     Attributes:
-        distributions: factor -> one distribution for each of its outputs, of the output's components together.
+        distributions: factor -> one distribution for each of its outputs, of the output's components together; of the
+            return and properties, whose only token is at step 0, where they are asked.
     """
 
     mask: Mask
     distributions: dict[str, list[Distribution]]
 
     def __getitem__(self, factor: str) -> list[Distribution]:
-        """One distribution for each component of `s` or `a`, its marginal, in the order in which the dataset stores
+        """One distribution for each component of a factor, its marginal, in the order in which the dataset stores
         them."""
         parts = [part for distribution in self.distributions[factor] for part in distribution.marginals()]
         return sorted(parts, key=lambda part: part.component.dims.start)
 
     def most_likely(self, factor: str) -> Tensor:
-        """(B, K, D): shown values as they are, the most likely ones where asked, NaN elsewhere."""
+        """(B, K, D): shown values as they are, the most likely ones where asked, NaN elsewhere; D without computed
+        numbers."""
         return self._tokens(factor, [distribution.most_likely for distribution in self.distributions[factor]])
 
     def draw(self, factor: str, generator: torch.Generator | None) -> Tensor:
@@ -241,6 +251,8 @@ def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None)
     predictions = model.predict(model.statistics.normalise(window), mask, cache)
     distributions: dict[str, list[Distribution]] = {}
     for name in predictions:
+        if name not in ASKABLE and not mask.asked[name].any():
+            continue
         shown = mask.shown[name].unsqueeze(-1)
         known = shown | mask.asked[name].unsqueeze(-1)  # (B, K, 1)
         distributions[name] = []

@@ -11,7 +11,7 @@ from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask
-from lerobot_unimask.language.training_masks import TrainingMasks
+from lerobot_unimask.language.training_masks import TrainingMasks, check_predicted
 from lerobot_unimask.networks.layers import Cache, Predictions
 
 
@@ -46,10 +46,12 @@ def predict(model: Learnt, window: Window, mask: Mask, cache: Cache | None = Non
         cache: what the rollout that asks has computed before; of a causal prediction that is not computed again.
 
     Raises:
-        MaskError: the model attends causally alone and has not learnt to answer this.
+        MaskError: the model attends causally alone and has not learnt to answer this, or asks for what it does not
+            predict.
     """
     network, causally = model.network, model.training_masks.answered_causally(mask)
-    if all(torch.equal(causally[name], mask.asked[name]) for name in causally):
+    check_predicted(mask, model.config.predicted(mask.asked))
+    if all(torch.equal(causally[name], asked) for name, asked in mask.asked.items()):
         return network(window, mask.shown, True, cache, mask.asked)
     if model.config.attention == "causal":
         raise MaskError(

@@ -54,7 +54,7 @@ def pose_question(
         if mask.causal is not False:
             raise ValueError("A question's direction follows from what it asks: leave out the Mask's `causal`.")
         text = mask.draw()
-        hidden = {name: torch.zeros_like(window.valid) for name in cameras}
+        hidden = {name: torch.zeros_like(window.valid) for name in (*model.factors, *cameras)}
         mask = Mask(hidden | mask.shown, hidden | mask.asked)
     else:
         table = tabulate(mask, tuple(model.factors), K, tuple(cameras))

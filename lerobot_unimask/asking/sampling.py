@@ -63,7 +63,8 @@ def sample(
         all samples that happen to pass are.
 
     Args:
-        order: `forward` in time (s0, a0, s1, ...), `backward`, or `random` (one order for the whole batch).
+        order: `forward` in time (s0, a0, s1, ..., after the return and properties), `backward`, or `random` (one order
+            for the whole batch).
         generator: source of the draws, on the window's device; None: torch's global one.
         check: tells which samples contradict themselves; called after each drawn token with the samples that drew it.
         tries: number of times that a token is drawn before its sample starts over, and that a sample starts before all
@@ -76,8 +77,9 @@ def sample(
     if order not in ORDERS:
         raise ValueError(f"order is {text_of(order)}; choose one of {', '.join(ORDERS)}.")
     check_count(tries, "tries")
-    asked = torch.stack([mask.asked[name].any(0) for name in ASKABLE], dim=1)  # (K, 2)
-    tokens = [(ASKABLE[i], step) for step, i in asked.nonzero().tolist()]  # forward
+    names = [name for name in model.factors if name not in ASKABLE] + list(ASKABLE)
+    asked = torch.stack([mask.asked[name].any(0) for name in names], dim=1)  # (K, factors)
+    tokens = [(names[i], step) for step, i in asked.nonzero().tolist()]  # forward
     if order == "backward":
         tokens.reverse()
     elif order == "random":
@@ -104,9 +106,11 @@ def sample(
             question = Mask(shown, nothing | {name: here})
             said = answer(model, Window(values, samples.valid[rows]), question)
             shown = shown | {name: shown[name] | here}
-            redraw = here[:, step].nonzero().squeeze(-1)
+            redraw, given = here[:, step].nonzero().squeeze(-1), model.factors[name].given_size
+            values[name][redraw, step, given:] = window.values[name][rows[redraw], step, given:]  # what is computed
             for _ in range(tries):
-                values[name][redraw, step] = said.at(name, redraw, step, drawn=True, generator=generator)
+                drawn = said.at(name, redraw, step, drawn=True, generator=generator)
+                values[name][redraw, step, :given] = drawn
                 samples.drawn += len(redraw)
                 redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(shown, redraw))]
                 samples.rejected += len(redraw)
@@ -116,7 +120,7 @@ def sample(
                 going_on = torch.ones_like(rows, dtype=torch.bool).index_fill(0, redraw, False)
                 stuck.append(rows[~going_on])
                 values, shown, rows = _rows(values, going_on), _rows(shown, going_on), rows[going_on]
-        for name in ASKABLE:
+        for name in dict(tokens):
             samples.values[name][rows] = values[name]
         return torch.cat(stuck)
 

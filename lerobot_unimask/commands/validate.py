@@ -1,6 +1,7 @@
 """`unimask validate`: the validation loss of each task."""
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags
@@ -14,10 +15,17 @@ def add(commands: Any) -> None:
         "--exact", metavar="EXPERT", help="expert of the data, whose exact optimum is set beside the models (DoorKey)"
     )
     output_flag(parser)
+    parser.add_argument(
+        "--plot",
+        type=Path,
+        metavar="FILE",
+        help="draw how often the returns and properties come that are said to be so likely",
+    )
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.plots.reliability import reliability
     from lerobot_unimask.records import write_json
     from lerobot_unimask.validation import summary, validate
 
@@ -27,3 +35,5 @@ def _run(arguments: argparse.Namespace) -> None:
     print(summary(record))
     if arguments.output:
         write_json(arguments.output, {**record, "command": arguments.text})
+    if arguments.plot:
+        reliability(record).savefig(arguments.plot, dpi=150)

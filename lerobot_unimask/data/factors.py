@@ -159,7 +159,7 @@ class Factor:
 
     Attributes:
         components: its numbers, in the dataset's order.
-        outputs: what a network predicts of them.
+        outputs: what a network predicts of them, but for those that are computed.
     """
 
     name: str
@@ -220,7 +220,7 @@ def make_factors(
 
 def _outputs(components: Sequence[Component], *, joint: bool, gaussians: int) -> tuple[Output, ...]:
     discrete = [component for component in components if component.discrete]
-    continuous = [component for component in components if not component.discrete]
+    continuous = [component for component in components if not component.discrete and not component.computed]
     together = joint and math.prod(c.categories or 1 for c in discrete) <= MAX_JOINT
     groups = [discrete] if together else [[component] for component in discrete]
     outputs = [Output(tuple(group)) for group in groups if group]

@@ -45,8 +45,8 @@ RANDOM_MASK = "random_mask"  # not a question: each window draws how much of it 
 
 REGIMES: dict[str, tuple[str, ...]] = {"multi_task": tuple(TASKS)}
 
-# Every other factor is a camera, shown at any step and never asked, or a property, shown at step 0 and never asked.
-ASKABLE = ("s", "a")
+# Every other factor is a camera, shown at any step and never asked, or a property, shown or asked at step 0.
+ASKABLE = ("s", "a")  # at every step
 STATE = "state"  # in a text, the numbers of `s` without the cameras; in tables and masks these are the factor "s"
 
 
@@ -183,16 +183,17 @@ def tabulate(text: str, factors: tuple[str, ...], context_length: int, cameras: 
         cameras: names of its cameras, which the table has after the factors.
 
     Raises:
-        MaskError: unknown factor, a step outside the window, a camera or property asked for, a property shown after
-            step 0, nothing asked.
+        MaskError: unknown factor, a step outside the window, a camera asked for, a property after step 0, nothing
+            asked.
     """
     question = parse(text, factors)
     text = question.text
     _check_factors(question.terms, (*factors, *cameras), text)
     for term in question.asked:
-        if _own_factor(term.factor, factors) not in ASKABLE:
-            kind = " is a camera, which" if term.factor in cameras else ""
-            raise MaskError(f"{term.factor}{kind} can be shown but never asked; ask for s or a.", text, term.position)
+        if term.factor in cameras:
+            raise MaskError(
+                f"{term.factor} is a camera, which can be shown but never asked; ask for s or a.", text, term.position
+            )
     rows: list[tuple[int, Tensor, Tensor]] = []
     for t in range(context_length) if question.uses_t else (-1,):
         if not _admits(question.terms, context_length, t):
@@ -261,7 +262,7 @@ def _select(terms: Sequence[Term], factors: Sequence[str], cameras: Sequence[str
                 steps = range(step % K, step % K + 1)
             if own not in (*ASKABLE, *cameras) and any(steps):
                 raise MaskError(
-                    f"{term.factor} can be shown at step 0 only: write {term.factor}[0].", text, term.position
+                    f"{term.factor} has a token at step 0 only: write {term.factor}[0].", text, term.position
                 )
             for row in rows:
                 chosen[row, list(steps)] = True
@@ -317,7 +318,8 @@ class Mask:
 
     def next_tokens(self, cameras: Sequence[str] = ()) -> dict[str, Tensor]:
         """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and
-        action before it, any of the pictures before it, and nothing after; properties may be shown or not."""
+        action before it, any of the pictures before it, and nothing after; properties may be shown or not, and follow
+        nothing."""
         shown, asked = (
             torch.stack([tokens[name] for name in ASKABLE], dim=-1).flatten(1) for tokens in (self.shown, self.asked)
         )  # (B, 2 K), in the order of time
@@ -326,7 +328,9 @@ class Mask:
         history = shown.any(1, keepdim=True) & (shown == (order < count)).all(1, keepdim=True)
         for name in cameras:  # a picture stands after its step's state, which is shown where it is before
             history = history & (~self.shown[name] | self.shown["s"]).all(1, keepdim=True)
-        return dict(zip(ASKABLE, (history & asked & (order == count)).unflatten(1, (-1, 2)).unbind(-1), strict=True))
+        following = (history & asked & (order == count)).unflatten(1, (-1, 2)).unbind(-1)
+        nothing = torch.zeros_like(following[0])
+        return dict.fromkeys(self.asked, nothing) | dict(zip(ASKABLE, following, strict=True))
 
     def draw(self, window: int = 0) -> str:
         """One window's mask as text, in the notation of the class's docstring."""

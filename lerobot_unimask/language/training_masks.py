@@ -3,7 +3,7 @@
 Legend of shapes: B windows, K steps, F factors, R rows (one for each admissible t of each task), T tasks.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,8 @@ class TrainingMasks(nn.Module):
     A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
     apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
     cloning does, and of pictures those before it, or the same ones for all t. The causal form of random masking shows
-    all of these, each property with probability 1/2, and asks for every state and action but the first state.
+    all of these, each property with probability 1/2, and asks for every state and action but the first state: nothing
+    comes before a property either, so none is asked causally.
 
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
@@ -32,9 +33,11 @@ class TrainingMasks(nn.Module):
         context_length: K.
         causal_share: share of the windows that are causal.
         cameras: names of its cameras, whose tokens come after the factors'.
+        predicted: the factors that random masking asks for where it hides them, and questions may ask for.
 
     Raises:
-        MaskError: a text that does not fit the model, or with a causal share of 1 has no causal form.
+        MaskError: a text that does not fit the model, asks for what it does not predict, or with a causal share of 1
+            has no causal form.
         ValueError: no masks, or weights that are not positive numbers.
     """
 
@@ -57,6 +60,7 @@ class TrainingMasks(nn.Module):
         *,
         causal_share: float = 0.0,
         cameras: Sequence[str] = (),
+        predicted: Collection[str] = ASKABLE,
     ):
         super().__init__()
         self.cameras = tuple(cameras)
@@ -67,6 +71,8 @@ class TrainingMasks(nn.Module):
             for text in self.weights
             if text != RANDOM_MASK
         }
+        for table in tables.values():
+            check_predicted(table.masks(), predicted, table.question.text)
         tasks = {text: task for task, text in enumerate(self.weights)}
         self.random_task = tasks.get(RANDOM_MASK)
         empty = torch.zeros(0, len(self.factors), context_length, dtype=torch.bool)
@@ -75,8 +81,10 @@ class TrainingMasks(nn.Module):
         self._keep("shown", torch.cat([empty, *(table.shown for table in tables.values())]))
         self._keep("asked", torch.cat([empty, *(table.asked for table in tables.values())]))
         self._keep("task_of_row", torch.tensor([tasks[text] for text in tables for _ in tables[text].t]).long())
-        self._keep("askable", torch.tensor([name in ASKABLE for name in self.factors])[:, None])  # (F, 1)
-        self._keep("lasting", self.askable | torch.tensor([name in self.cameras for name in self.factors])[:, None])
+        lasting = torch.tensor([name in (*ASKABLE, *cameras) for name in self.factors])[:, None]  # (F, 1)
+        self._keep("lasting", lasting)
+        first = torch.arange(context_length) == 0
+        self._keep("askable", torch.tensor([name in predicted for name in self.factors])[:, None] & (lasting | first))
         self._keep("cumulative_weights", _cumulative(weights))
         forms = [self._causal_form(tables.get(text), context_length) for text in self.weights]
         capable = torch.tensor([form is not None for form in forms])
@@ -103,13 +111,14 @@ class TrainingMasks(nn.Module):
         """What a causal window of this task, None for random masking, shows and asks for: two (F, K), or None."""
         if table is None:
             shown = torch.ones(len(self.factors), K, dtype=torch.bool)
-            asked = self.askable.repeat(1, K)
+            asked = self.askable.clone()
             asked[self.factors.index("s"), 0] = False  # nothing of the window comes before it
+            asked[~self.lasting[:, 0]] = False
             shown[~self.lasting[:, 0], 1:] = False
             return shown, asked
         mask = table.masks()
         following = mask.next_tokens(self.cameras)
-        if any((following[name] != mask.asked[name]).any() for name in ASKABLE):
+        if any((following[name] != asked).any() for name, asked in mask.asked.items()):
             return None
         shown = table.shown.any(0)
         for name in self.cameras:  # all t share a window's pictures, those before each
@@ -194,6 +203,20 @@ class TrainingMasks(nn.Module):
                 hidden[:, f, 0] = uniform[:, f, 0] < 0.5
                 hidden[:, f, 1:] = True
         return hidden
+
+
+def check_predicted(mask: Mask, predicted: Collection[str], text: str | None = None) -> None:
+    """
+    Raises:
+        MaskError: the mask asks for a factor that is not predicted.
+    """
+    for name, asked in mask.asked.items():
+        if name not in predicted and asked.any():
+            raise MaskError(
+                f"This model does not predict {name}, which can only be shown to it: ask for {' or '.join(predicted)}, "
+                "or train it with ask_properties=true and an attention that is not causal alone.",
+                text or mask.draw(),
+            )
 
 
 def validation_masks(

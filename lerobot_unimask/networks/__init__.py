@@ -32,6 +32,7 @@ def make_network(config: UniMASKConfig, factors: dict[str, Factor], *, load_back
         case "transformer":
             return Transformer(
                 factors,
+                predicted=config.predicted(factors),
                 stacked=config.token_layout == "stacked",
                 residuals=config.state_residuals,
                 heads=config.heads,
@@ -44,7 +45,7 @@ def make_network(config: UniMASKConfig, factors: dict[str, Factor], *, load_back
                 **shared,
             )
         case "feedforward":
-            return FeedForward(factors, **shared)
+            return FeedForward(factors, predicted=config.predicted(factors), **shared)
         case "decision_transformer":
             return DecisionTransformer(factors, heads=config.heads, **shared)
         case other:

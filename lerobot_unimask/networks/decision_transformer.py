@@ -68,7 +68,7 @@ class DecisionTransformer(nn.Module):
         self.dropout = Dropout(dropout)
         self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
-        self.heads = Heads(factors, width)
+        self.heads = Heads(factors, ASKABLE, width)
         before = torch.ones(3 * context_length, 3 * context_length, dtype=torch.bool).tril()
         self.register_buffer("before", before, persistent=False)
 

@@ -3,6 +3,7 @@
 Legend of shapes: B windows, K steps, N tokens, W width, H inner width.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -23,7 +24,8 @@ class FeedForward(nn.Module):
         its first is ever shown; every token has weights of its own, so there are no position embeddings.
 
     Args:
-        factors: parts of a step. Every factor is read; `s` and `a` are predicted.
+        factors: parts of a step. Every factor is read.
+        predicted: names of those that are predicted.
         fine_inputs: whether `NumberEncoding` encodes continuous values.
         width: size of each token's embedding.
         depth: number of hidden layers.
@@ -34,6 +36,7 @@ class FeedForward(nn.Module):
         self,
         factors: dict[str, Factor],
         *,
+        predicted: Sequence[str] = ASKABLE,
         context_length: int,
         fine_inputs: bool,
         width: int,
@@ -53,7 +56,7 @@ class FeedForward(nn.Module):
                 for before, after in pairwise(widths)
             )
         )
-        self.heads = Heads(factors, feedforward_width, steps=context_length)
+        self.heads = Heads(factors, predicted, feedforward_width, steps=context_length)
 
     def forward(
         self,
@@ -69,4 +72,4 @@ class FeedForward(nn.Module):
             [token.flatten(1) if name in ASKABLE else token[:, 0] for name, token in tokens.items()], dim=1
         )  # (B, N W)
         x = self.hidden(x).unsqueeze(1)  # (B, 1, H)
-        return self.heads(dict.fromkeys(ASKABLE, x))
+        return self.heads(dict.fromkeys(self.heads, x))

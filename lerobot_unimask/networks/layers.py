@@ -4,7 +4,6 @@ Legend of shapes: B windows, K steps, N tokens, D the numbers of a factor, W wid
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -148,32 +147,38 @@ class Heads(nn.ModuleDict):
     """A linear layer for each predicted factor. Answers are in full precision also under mixed precision.
 
     Args:
+        predicted: names of the factors that are predicted.
         width: size of what they read.
-        steps: number of steps that are predicted from one input.
+        steps: number of steps that are predicted from one input; of a property one.
     """
 
-    def __init__(self, factors: dict[str, Factor], width: int, *, steps: int = 1):
-        sizes = {name: [output.size for output in factors[name].outputs] for name in ASKABLE}
-        super().__init__({name: nn.Linear(width, steps * sum(of_factor)) for name, of_factor in sizes.items()})
-        self.sizes = sizes
-        self.steps = steps
+    def __init__(self, factors: dict[str, Factor], predicted: Sequence[str], width: int, *, steps: int = 1):
+        sizes = {name: [output.size for output in factors[name].outputs] for name in predicted}
+        steps_of = {name: steps if name in ASKABLE else 1 for name in predicted}
+        super().__init__({name: nn.Linear(width, steps_of[name] * sum(parts)) for name, parts in sizes.items()})
+        self._sizes, self._steps = sizes, steps_of  # underscored: a property may have any name
 
     def forward(self, x: dict[str, Tensor], asked: dict[str, Tensor] | None = None) -> Predictions:
         """
         Args:
-            x: factor -> (B, K / steps, W); with `asked`, (M, W) of its M asked tokens.
+            x: factor -> (B, K / steps, W), of a property (B, 1, W), of those that are to be predicted; with `asked`,
+                (M, W) of its M asked tokens.
             asked: factor -> (B, K) bool, True = asked; what is predicted of the others is 0.
+
+        Returns:
+            (B, K, size) of each output; of a property's steps all but the first are 0.
         """
         with torch.autocast(x["s"].device.type, enabled=False):
-            outputs = {name: head(x[name].float()) for name, head in self.items()}
-        if asked is not None:
-            for name, output in outputs.items():
+            outputs = {name: self[name](tokens.float()) for name, tokens in x.items()}
+        K = self._steps["s"] * outputs["s"].shape[1] if asked is None else asked["s"].shape[1]
+        for name, output in outputs.items():
+            if asked is None:
+                output = output.unflatten(-1, (self._steps[name], -1)).flatten(1, 2)
+                outputs[name] = functional.pad(output, (0, 0, 0, K - output.shape[1]))
+            else:
                 everywhere = output.new_zeros(*asked[name].shape, output.shape[-1])
                 outputs[name] = everywhere.masked_scatter(asked[name].unsqueeze(-1), output)
-        return {
-            name: list(output.unflatten(-1, (self.steps, -1)).flatten(1, 2).split(self.sizes[name], dim=-1))
-            for name, output in outputs.items()
-        }
+        return {name: list(output.split(self._sizes[name], dim=-1)) for name, output in outputs.items()}
 
 
 def by_component(predictions: Predictions, factors: Mapping[str, Factor]) -> Predictions:
@@ -185,7 +190,7 @@ def by_component(predictions: Predictions, factors: Mapping[str, Factor]) -> Pre
             for whole, output in zip(wholes, factors[name].outputs, strict=True)
             for part, component in zip(marginals(whole, output), output.components, strict=True)
         }
-        apart[name] = [parts[component.dims.start] for component in factors[name].components]
+        apart[name] = [parts[c.dims.start] for c in factors[name].components if not c.computed]
     return apart
 
 
@@ -201,45 +206,6 @@ def marginals(prediction: Tensor, output: Output) -> list[Tensor]:
     table = prediction.unflatten(-1, output.categories)
     axes = range(-len(output.categories), 0)
     return [table.logsumexp([other for other in axes if other != axis]) for axis in axes]
-
-
-def joined(
-    weights: Mapping[str, Tensor], saved: Mapping[str, Factor], wanted: Mapping[str, Factor]
-) -> dict[str, Tensor]:
-    """A checkpoint's heads as those that training goes on with. Separate heads become joint ones, which at first answer
-    the same: the logit of a combination is the sum of its categories'. Gaussians become a mixture whose parts begin at
-    their means, each with another scale, so that the parts can come to differ. Of heads that are as wanted, nothing."""
-    heads: dict[str, Tensor] = {}
-    for key, rows in weights.items():
-        found = re.fullmatch(r"network\.heads\.(\w+)\.(weight|bias)", key)
-        if found is None or saved == wanted:
-            continue
-        outputs = saved[found[1]].outputs
-        sizes = [output.size for output in outputs]
-        parts = rows.unflatten(0, (-1, sum(sizes))).split(sizes, dim=1)  # (steps, size, ...) each
-        of_number = {output.numbers[0]: part for output, part in zip(outputs, parts, strict=True)}
-        whole = []
-        for output in wanted[found[1]].outputs:
-            total, *others = (of_number[number] for number in output.numbers if number in of_number)
-            if output.gaussians > 1 and outputs[-1].gaussians == 1:
-                total = _begin_mixture([total, *others], output.gaussians, bias=found[2] == "bias")
-            else:
-                for other in others:
-                    total = (total.unsqueeze(2) + other.unsqueeze(1)).flatten(1, 2)
-            whole.append(total)
-        heads[key] = torch.cat(whole, dim=1).flatten(0, 1)
-    return heads
-
-
-def _begin_mixture(gaussians: Sequence[Tensor], count: int, *, bias: bool) -> Tensor:
-    """The rows of a head that predicts `count` Gaussians, from those of one for each component, (steps, 2 d, ...)."""
-    means, scales = (torch.cat(part, dim=1) for part in zip(*(rows.chunk(2, dim=1) for rows in gaussians), strict=True))
-    factors = (
-        torch.arange(count, device=means.device) / 2 * bias
-    )  # logarithms: each part is narrower than the one before
-    scales = torch.cat([scales - factor for factor in factors], dim=1)
-    logits = torch.zeros_like(means[:, :1]).repeat_interleave(count, dim=1)
-    return torch.cat([logits, torch.cat([means] * count, dim=1), scales], dim=1)
 
 
 @dataclass

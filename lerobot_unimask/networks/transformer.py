@@ -7,7 +7,7 @@ it and those before it, so that one pass answers for every step of a window.
 Legend of shapes: B windows, K steps, F factors, N tokens, D the dimensions of a factor, W width, H heads.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -34,7 +34,8 @@ class Transformer(nn.Module):
     """(window, shown) -> predictions.
 
     Args:
-        factors: what a step consists of. Every factor is read; `s` and `a` are predicted.
+        factors: what a step consists of. Every factor is read.
+        predicted: names of those that are predicted: `s`, `a`, and properties, those in both directions alone.
         cameras: those whose pictures a step has.
         backbone: arguments of each camera's `CameraEncoder`.
         stacked: one token per step, made of all its factors (paper, appendix "Input stacking"), which cannot attend
@@ -48,6 +49,7 @@ class Transformer(nn.Module):
         self,
         factors: dict[str, Factor],
         *,
+        predicted: Sequence[str] = ASKABLE,
         context_length: int,
         stacked: bool,
         residuals: bool,
@@ -78,7 +80,7 @@ class Transformer(nn.Module):
         self.on_course = {
             i: output for i, output in enumerate(factors["s"].outputs) if residuals and not output.discrete
         }
-        self.heads = Heads(factors, width)
+        self.heads = Heads(factors, predicted, width)
         self.cameras = nn.ModuleDict(
             {name: CameraEmbedding(camera.shape, width, **(backbone or {})) for name, camera in cameras.items()}
         )
@@ -121,7 +123,7 @@ class Transformer(nn.Module):
             if causal is not False:  # the token before; nothing stands before the first one
                 before = functional.pad(x, (0, 0, 1, -1))
                 x = before if causal is True else torch.where(causal[:, None, None], before, x)
-            predictions = self.heads(dict.fromkeys(ASKABLE, x) if self.stacked else self._split(x))
+            predictions = self.heads(self._split(x, ASKABLE if causal is True else self.heads))
         if self.on_course and (asked is None or static or asked["s"].any()):
             states = torch.where(shown["s"].unsqueeze(-1), window.values["s"], 0.0)
             ahead = course(states, shown["s"], causal)
@@ -137,14 +139,16 @@ class Transformer(nn.Module):
         earlier = (
             int(causal) if isinstance(causal, bool) else causal.long()[:, None]
         )  # 1: predicted from the one before
+        names = list(ASKABLE if causal is True else self.heads)
         step = len(self.properties) + len(self.order) * torch.arange(asked["s"].shape[1]) - earlier
         position = [(step + self.order.index(name)).expand(B, -1)[asked[name]] for name in ASKABLE]
-        window = [asked[name].nonzero()[:, 0] for name in ASKABLE]
+        window = [asked[name].nonzero()[:, 0] for name in names]
+        position += [torch.full_like(w, self.properties.index(n)) for n, w in zip(names[2:], window[2:], strict=True)]
         sizes = [len(rows) for rows in position]
         place = torch.cat(position)  # (M,) of what each asked token is predicted from, in its window; -1: nothing
         x = self.norm(self._attend(x, causal, torch.cat(window) * N + place.clamp_min(0)))
         x = torch.where((place >= 0).unsqueeze(-1), x, 0.0)
-        return self.heads(dict(zip(ASKABLE, x.split(sizes), strict=True)), asked)
+        return self.heads(dict(zip(names, x.split(sizes), strict=True)), asked)
 
     def _attend(self, x: Tensor, causal: Tensor | bool, read: Tensor | None = None) -> Tensor:
         """All tokens, (B, N, W) -> (B, N, W), or those whose numbers among the B N tokens are `read`: (M, W)."""
@@ -186,6 +190,12 @@ class Transformer(nn.Module):
         steps = torch.stack([tokens[name] for name in self.order], dim=2).flatten(1, 2)  # (B, n K, W)
         return torch.cat([*(tokens[name][:, :1] for name in self.properties), steps], dim=1)
 
-    def _split(self, x: Tensor) -> dict[str, Tensor]:
+    def _split(self, x: Tensor, names: Iterable[str]) -> dict[str, Tensor]:
+        """(B, N, W) -> what each factor's tokens are predicted from: (B, K, W), of a property (B, 1, W)."""
+        if self.stacked:
+            return {name: x if name in ASKABLE else x[:, :1] for name in names}
         steps = x[:, len(self.properties) :].unflatten(1, (-1, len(self.order)))  # (B, K, n, W)
-        return {name: steps[:, :, self.order.index(name)] for name in ASKABLE}
+        return {
+            name: steps[:, :, self.order.index(name)] if name in ASKABLE else x[:, self.properties.index(name), None]
+            for name in names
+        }

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from lerobot_unimask.asking.answers import Answer, ContinuousDistribution, DiscreteDistribution
+from lerobot_unimask.asking.answers import Answer, ContinuousDistribution, DiscreteDistribution, Distribution
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE, Mask
@@ -69,7 +70,8 @@ def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
 
 
 def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -> Figure:
-    """What a model of any factors says about each component at each step: probabilities, or means and scales.
+    """What a model of any factors says about each component at each step: probabilities, or means and scales; about the
+    return and a property the one distribution, as bars or as a density.
 
     Args:
         answer: one to any question.
@@ -78,32 +80,63 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
     """
     rows = [(name, distribution) for name in answer.distributions for distribution in answer[name]]
     rows = [(name, d) for name, d in rows if answer.mask.asked[name][window].any()]
-    heights = [0.5 + 0.13 * min(d.component.categories or 12, 20) for _, d in rows]
+    rows.sort(key=lambda row: row[0] not in ASKABLE)  # properties, which have no steps, below
+    heights = [0.5 + 0.13 * min(d.component.categories or 12, 20) if name in ASKABLE else 1.5 for name, d in rows]
     figure = Figure(figsize=(WIDTH, 0.9 + sum(heights)), layout="constrained")
-    grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
+    grid = figure.subplots(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+    K = answer.mask.shown["s"].shape[1]
+    maps = [axes for axes, (name, d) in zip(grid, rows, strict=True) if name in ASKABLE]
     for axes, (name, distribution) in zip(grid, rows, strict=True):
         recorded = None
         if truth is not None:
             recorded = truth.values[name][window, :, distribution.component.dims].numpy(force=True)  # (K, d)
             recorded = np.where(truth.valid[window].numpy(force=True)[:, None], recorded, np.nan)
         shown = answer.mask.shown[name][window].numpy(force=True)  # (K,)
+        axes.set_ylabel(f"{name}: {distribution.name}", fontsize=SMALL + 1)
+        axes.tick_params(labelsize=SMALL)
+        if name not in ASKABLE:
+            _draw_property(axes, distribution, None if recorded is None else recorded[0, 0], window)
+            continue
+        axes.set(xlim=(-0.5, K - 0.5), xticks=range(0, K, max(1, K // 20)))
+        axes.tick_params(labelbottom=axes is maps[-1])
         if isinstance(distribution, DiscreteDistribution):
             _draw_heat_map(axes, distribution, recorded, shown, window)
         else:
             _draw_bands(axes, distribution, recorded, shown, window)
-        axes.set_ylabel(f"{name}: {distribution.name}", fontsize=SMALL + 1)
-        axes.tick_params(labelsize=SMALL)
-    K = answer.mask.shown["s"].shape[1]
-    grid[-1].set(xlim=(-0.5, K - 0.5), xlabel="step", xticks=range(0, K, max(1, K // 20)))
-    if any(isinstance(d, DiscreteDistribution) for _, d in rows):
+    if maps:
+        maps[-1].set_xlabel("step")
+    if any(isinstance(d, DiscreteDistribution) and name in ASKABLE for name, d in rows):
         probability = ScalarMappable(Normalize(0, 1), "Blues")
-        colorbar = figure.colorbar(probability, ax=list(grid), shrink=0.8, aspect=25, pad=0.01)
+        colorbar = figure.colorbar(probability, ax=maps, shrink=0.8, aspect=25, pad=0.01)
         colorbar.set_label("probability", fontsize=SMALL + 1)
         colorbar.ax.tick_params(labelsize=SMALL, length=2)
     point: dict[str, Any] = {"marker": "x", "linestyle": "none", "markersize": 5, "color": VERMILLION}
     handles = [shown_handle()] + [Line2D([], [], label="recorded", **point)] * (truth is not None)
     figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=SMALL + 1, frameon=False)
     return figure
+
+
+def _draw_property(axes: Axes, distribution: Distribution, recorded: float | None, window: int) -> None:
+    """The distribution of its token: a bar for each category, or the density, of an L2 head its mean alone."""
+    here = distribution.at(torch.tensor([window]), 0)
+    if isinstance(here, DiscreteDistribution):
+        probabilities = here.probabilities[0, 0].numpy(force=True)
+        labels = here.component.labels or range(len(probabilities))
+        axes.bar(range(len(probabilities)), probabilities, 0.8, color=BLUE)
+        axes.set(ylim=(0, 1), xticks=range(len(probabilities)))
+        axes.set_xticklabels([str(label) for label in labels])
+    elif here.scales is None:
+        axes.axvline(here.mean.item(), color=BLUE)
+        axes.set_yticks([])
+    else:
+        reach = 4 * here.scales[0, 0, :, 0]
+        ends = torch.cat([here.means[0, 0, :, 0] - reach, here.means[0, 0, :, 0] + reach])
+        places = torch.linspace(ends.min().item(), ends.max().item(), 401)
+        below = here.cumulative(places.to(ends.device).view(1, 1, -1))[0, 0].numpy(force=True)  # a spike keeps its mass
+        axes.stairs(np.diff(below), places.numpy(), fill=True, color=BLUE)
+        axes.set_yticks([])
+    if recorded is not None and not np.isnan(recorded):
+        axes.axvline(recorded, color=VERMILLION, linestyle="--", linewidth=1.2)
 
 
 def _draw_heat_map(
@@ -142,7 +175,8 @@ def _draw_bands(
 
 
 def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -> Figure:
-    """How often each state and action occurs, over all windows and steps: recorded ones beside sampled ones, say.
+    """How often each state, action and property occurs, over all windows and steps: recorded ones beside sampled ones,
+    say.
 
     Args:
         groups: name of a group, for people -> its windows, in the dataset's units. What is NaN or not valid is left
@@ -153,8 +187,10 @@ def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -
         ValueError: there is nothing that all groups have.
     """
     parts = []  # of each number: its label, component, and each group's values
-    for name in ASKABLE:
+    for name in factors:
         for component in factors[name].components:
+            if component.computed or not all(name in window.values for window in groups.values()):
+                continue
             for i in range(component.dims.start, component.dims.stop):
                 column = {group: window.values[name][..., i][window.valid] for group, window in groups.items()}
                 values = {group: v[~v.isnan()].numpy(force=True) for group, v in column.items()}
@@ -162,7 +198,7 @@ def distributions(groups: Mapping[str, Window], factors: Mapping[str, Factor]) -
                     label = component.names[i - component.dims.start]
                     parts.append((f"{name}: {label}", component, values))
     if not parts:
-        raise ValueError("There is no state or action that all of the windows have: nothing to draw.")
+        raise ValueError("There is no token that all of the windows have: nothing to draw.")
     columns = min(3, len(parts))
     figure = Figure(figsize=(WIDTH, 0.5 + 2.3 * -(-len(parts) // columns)), layout="constrained")
     grid = figure.subplots(-(-len(parts) // columns), columns, squeeze=False).flat

@@ -12,14 +12,15 @@ from lerobot_unimask.envs.doorkey.optimum import exact_answer
 from lerobot_unimask.envs.doorkey.pictures import state_distributions, trajectories
 from lerobot_unimask.envs.doorkey.rules import ENV_ID, HORIZON, DynamicsCheck
 from lerobot_unimask.envs.record import Environment, ExactOptimum, Provenance
-from lerobot_unimask.language.masks import Mask
+from lerobot_unimask.language.masks import ASKABLE, Mask
 
 
 def _draw_answer(
     question: str, answer: Answer | Samples, mask: Mask, recorded: Window | None, provenance: Provenance
 ) -> Figure | None:
-    """Where the agent and the key are, if every state is shown or asked."""
-    if not (mask.shown["s"] | mask.asked["s"]).all():
+    """Where the agent and the key are, if every state is shown or asked, and no return or property is."""
+    beside = any(asked.any() for name, asked in mask.asked.items() if name not in ASKABLE)
+    if beside or not (mask.shown["s"] | mask.asked["s"]).all():
         return None
     if isinstance(answer, Samples):
         return trajectories({question: answer.values["s"].long().numpy(force=True)})

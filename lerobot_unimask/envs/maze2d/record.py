@@ -10,14 +10,15 @@ from lerobot_unimask.data.window import Window
 from lerobot_unimask.envs.maze2d.maze import ENV_ID, HORIZON
 from lerobot_unimask.envs.maze2d.pictures import draw_ways, maze_trajectories
 from lerobot_unimask.envs.record import Environment, Provenance
-from lerobot_unimask.language.masks import Mask
+from lerobot_unimask.language.masks import ASKABLE, Mask
 
 
 def _draw_answer(
     question: str, answer: Answer | Samples, mask: Mask, recorded: Window | None, provenance: Provenance
 ) -> Figure | None:
-    """Where the mass is over the maze, if states are asked."""
-    if isinstance(answer, Samples) or not mask.asked["s"].any():
+    """Where the mass is over the maze, if states are asked, and no return or property is."""
+    beside = any(asked.any() for name, asked in mask.asked.items() if name not in ASKABLE)
+    if isinstance(answer, Samples) or beside or not mask.asked["s"].any():
         return None
     return maze_trajectories(answer, recorded, maze=maze_of(provenance))
 
