@@ -23,7 +23,7 @@ from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
-from lerobot_unimask.data.episodes import read_info
+from lerobot_unimask.data.episodes import check_format
 from lerobot_unimask.data.taking_over import keep_to
 from lerobot_unimask.sharing import hub
 
@@ -88,7 +88,7 @@ def _read_as_this_policy_needs() -> None:
             )
         root = Path(cfg.dataset.root or "")
         if cfg.dataset.root and (root / "meta" / "info.json").exists():
-            read_info(root)  # a damaged one ends in one sentence
+            check_format(root)  # one that is old or damaged ends in one sentence
         with _without_imagenet_statistics(cfg):
             dataset = lerobots_make_dataset(cfg)
         opened[:] = [dataset]

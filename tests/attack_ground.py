@@ -35,6 +35,7 @@ from lerobot_unimask.sharing import cards, hub  # noqa: E402
 logging.getLogger("lerobot").setLevel(logging.ERROR)
 
 SECONDS = 5.0  # of processor time, for one attempt
+ENDED = os.WEXITED | os.WNOHANG | os.WNOWAIT  # whether a process has, which stays to be waited for
 EXPECTED = (ValueError, OSError)  # what the commands print as one sentence; MaskError and HubError are among them
 Outcome = str | None  # what was lost, or nothing
 Attack = Callable[[int, Path], Iterator[tuple[str, Outcome]]]  # attempts, a dataset -> each one's outcome
@@ -57,8 +58,18 @@ def attempt(call: Callable[[], Any], check: Callable[[Any], Outcome] = lambda _:
     return kind, lost
 
 
-def forked(work: Callable[[], Any], *, kill_after: float | None = None, most_bytes: int | None = None) -> int | None:
-    """Run in a forked process, that is killed or may write no larger file; its exit status, None if it was killed."""
+def forked(
+    work: Callable[[], Any],
+    *,
+    kill_after: float | None = None,
+    kill_from: Path | None = None,
+    most_bytes: int | None = None,
+) -> int | None:
+    """Run in a forked process, that is killed or may write no larger file; its exit status, None if it was killed.
+
+    Args:
+        kill_after: seconds from the start, or from when there is a file `kill_from`.
+    """
     child = os.fork()
     if child == 0:
         for stream in (1, 2):
@@ -76,6 +87,8 @@ def forked(work: Callable[[], Any], *, kill_after: float | None = None, most_byt
         except BaseException:
             os._exit(1)
     if kill_after is not None:
+        while kill_from is not None and not kill_from.exists() and os.waitid(os.P_PID, child, ENDED) is None:
+            time.sleep(0.002)
         time.sleep(kill_after)
         os.kill(child, signal.SIGKILL)
     status = os.waitpid(child, 0)[1]

@@ -113,7 +113,8 @@ def killed_prepares(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
         source = Path(shutil.copytree(root, HOME / "prepares" / str(i)))
         output = source.with_name(f"{i}_new") if i % 2 else None
         place = output or source
-        forked(lambda s=source, o=output: renamed(s, o), kill_after=draw.uniform(0, 1.2 * seconds))
+        begun = place.with_name(f".{place.name}.partial")
+        forked(lambda s=source, o=output: renamed(s, o), kill_after=draw.uniform(0, seconds), kill_from=begun)
         kind, lost = "refused", None
         if place.exists():
             read, lost = attempt(lambda p=place: first_windows(open_dataset(CONFIG(), p)))
@@ -165,12 +166,12 @@ def last_loads(run: Path) -> tuple[str, Outcome]:
 
 
 def killed_trainings(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
-    """lerobot-train killed at any time, a checkpoint at each update: the last one loads, and resuming ends the run."""
+    """lerobot-train killed while it saves a checkpoint or soon after; the last one loads, and resuming ends the run."""
     draw, flags = random.Random(0), [*TRAIN, f"--dataset.root={root}"]
-    seconds = duration(lambda: train(*flags, f"--output_dir={HOME / 'unkilled'}"))
     for i in range(count):
         run = HOME / "trainings" / str(i)
-        forked(lambda r=run: train(*flags, f"--output_dir={r}"), kill_after=draw.uniform(0.2, 1.2) * seconds)
+        begun = run / "checkpoints" / f"{1 + i % UPDATES:06d}" / "pretrained_model"
+        forked(lambda r=run: train(*flags, f"--output_dir={r}"), kill_after=draw.uniform(0, 0.3), kill_from=begun)
         kind, lost = last_loads(run)
         config = run / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
         if config.exists() and (run / "checkpoints" / "last").resolve().name != f"{UPDATES:06d}":

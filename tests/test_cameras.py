@@ -15,6 +15,7 @@ from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.measures import action_error
+from lerobot_unimask.networks import vision
 from lerobot_unimask.sharing import cards
 from lerobot_unimask.validation import task_losses
 
@@ -331,6 +332,22 @@ def test_what_looks_learns_at_a_rate_of_its_own(make):
 def test_a_resnet_looks(make, batch):
     policy = make(vision_backbone="resnet18", image_size=[64, 64], cameras=["observation.images.top"])
     assert policy.select_action(observation(batch, 0)).isfinite().all()
+
+
+def test_pictures_of_another_size_are_resized_which_is_said_once(make, batch, caplog):
+    vision._say_once.cache_clear()
+    policy, larger = make(), observation(batch, 0)
+    for key in COLUMNS.values():
+        larger[key] = torch.nn.functional.interpolate(larger[key], scale_factor=2, mode="nearest")
+    resized = {**larger, **{key: frames.resized(larger[key], (SIDE, SIDE)) for key in COLUMNS.values()}}
+    actions = []
+    for shown in (larger, larger, resized):
+        policy.reset()
+        actions.append(policy.select_action(shown))
+    torch.testing.assert_close(actions[0], actions[2])
+    said = [message for message in caplog.messages if "32 x 32" in message]
+    assert len(said) == 1
+    assert f"{SIDE} x {SIDE}" in said[0]
 
 
 def test_one_picture_serves_all_steps_of_a_causal_window(make, batch):

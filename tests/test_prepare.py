@@ -9,6 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import factory
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from policies import SMALL_FLAGS
 
@@ -181,6 +184,14 @@ def test_without_an_output_it_says_what_it_would_do_and_why(renamed, blind, old,
         said = capsys.readouterr().out
         assert [word for word in words if word not in said] == []
         assert files(root) == before
+
+
+def test_an_old_format_is_refused_with_the_command_that_brings_it_up_to_date(old):
+    with pytest.raises(ValueError, match=r"v2\.1.*unimask prepare"):
+        open_dataset(UniMASKConfig(device="cpu"), old)
+    config = TrainPipelineConfig(DatasetConfig("me/robot", root=str(old)), policy=UniMASKConfig(device="cpu"))
+    with pytest.raises(ValueError, match=r"v2\.1.*unimask prepare"):
+        factory.make_dataset(config)
 
 
 def test_joint_names_are_kept(renamed, blind, tmp_path):

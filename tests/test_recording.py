@@ -103,6 +103,22 @@ def test_cameras_that_are_not_read_are_not_decoded(train, monkeypatch, tmp_path)
     assert set(decoded) == {"observation.images.phone"}
 
 
+def test_pictures_are_augmented_as_lerobot_does(train, recording, tmp_path, monkeypatch):
+    """Read one by one, at their own size; no frames are decoded beforehand."""
+    batches = []
+    forward = UniMASKPolicy.forward
+    monkeypatch.setattr(UniMASKPolicy, "forward", lambda self, batch: batches.append(batch) or forward(self, batch))
+    brighter = '{"brighter": {"type": "ColorJitter", "kwargs": {"brightness": [2.0, 2.0]}}}'
+    augmented = ["--dataset.image_transforms.enable=true", f"--dataset.image_transforms.tfs={brighter}"]
+    train(*POLICY, f'--policy.cameras=["{CAMERAS[0]}"]', *augmented, "--steps=1", "--output_dir=augmented")
+    assert not (tmp_path / "frames").exists()
+    plain = LeRobotDataset("local/arm", root=recording)
+    for frame, picture in zip(batches[0]["index"].tolist(), batches[0][CAMERAS[0]][:, 0], strict=True):
+        expected = (plain[frame][CAMERAS[0]] * 2).clamp_max(1)
+        assert picture.shape == expected.shape
+        assert (picture.float() / (255 if picture.dtype == torch.uint8 else 1) - expected).abs().max() < 1.5 / 255
+
+
 @pytest.mark.slow
 def test_uncached_it_learns_the_same(train, tmp_path):
     losses = {}

@@ -34,6 +34,19 @@ def check_folder(root: Path) -> None:
     read_info(root)
 
 
+def check_format(root: Path) -> None:
+    """
+    Raises:
+        ValueError: its info.json is damaged, or it is a dataset of a format that LeRobot no longer reads.
+    """
+    version = read_info(root)["codebase_version"]
+    if version.startswith("v2"):
+        raise ValueError(
+            f"{root} has LeRobot's format {version}, and LeRobot reads v3.0: `unimask prepare --dataset.root={root} "
+            "--output=DIR` writes it anew."
+        )
+
+
 def read_info(root: Path) -> dict[str, Any]:
     """A dataset's meta/info.json, its entries of the types and sizes that they can have.
 
@@ -104,6 +117,7 @@ def open_dataset(
     """
     if root is not None:
         check_folder(root)
+        check_format(root)
     repo_id = repo_id or LOCAL
     meta = LeRobotDatasetMetadata(repo_id, root=root)
     deltas = resolve_delta_timestamps(config, meta)

@@ -194,8 +194,8 @@ class ReadsCameras(Protocol):
 
 def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobotDataset | None = None) -> None:
     """From here on the dataset has the cameras that a policy reads, and decodes no others; their frames are cached
-    where the settings say so. Columns of texts go too, which cannot be read in batches and which no policy of ours
-    reads.
+    where the settings say so and LeRobot does not augment them. Columns of texts go too, which cannot be read in
+    batches and which no policy of ours reads.
 
     Args:
         whole: dataset with more episodes of the same folder whose frames are cached already.
@@ -214,7 +214,7 @@ def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobot
         hf_dataset = dataset.hf_dataset
         stored = [key for key in unread if key in hf_dataset.column_names]
         dataset.reader.hf_dataset = hf_dataset.remove_columns(stored)
-    if not wanted or not settings.cache_frames:
+    if not wanted or not settings.cache_frames or dataset.image_transforms is not None:
         return
     if whole is not None and whole in _frames:
         index, of_whole = (one.hf_dataset.data.column("index").to_numpy() for one in (dataset, whole))
