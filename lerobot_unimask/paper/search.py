@@ -23,6 +23,7 @@ from lerobot_unimask.data.episodes import open_dataset
 from lerobot_unimask.measures import unseen_windows
 from lerobot_unimask.paper.early_stopping import train_to_lowest
 from lerobot_unimask.paper.study import Run, VariantsConfig, run_study, write_results
+from lerobot_unimask.records import markdown_table
 from lerobot_unimask.training import Trainer, check_settings
 
 BATCH_SIZE = "batch_size"  # the one setting that is not the policy's
@@ -177,25 +178,20 @@ def _loss(record: Mapping[str, Any]) -> float:
 def markdown(record: Mapping[str, Any]) -> str:
     """The best settings of each model as a table."""
     config = record["config"]
-    lines = [
+
+    def row(model: str, chosen: Mapping[str, Any]) -> list[str]:
+        drawn = (chosen["drawn"][name] for name in config["space"])
+        texts = (f"{value:.2g}" if isinstance(value, float) else str(value) for value in drawn)
+        return [f"`{model}`", f"{chosen['loss']:.4f}", f"{chosen['median_loss']:.4f}", *texts]
+
+    heads = ("model", "loss", "median", *(f"`{name}`" for name in config["space"]))
+    return (
         f"Random search, {config['environment']}, {config['episodes']} episodes: {config['draws']} draws of "
         f"{len(config['seeds'])} seed(s), {config['steps']} updates each. For each model the draw with the lowest "
         f"validation loss on what it is trained on ({config['validation_episodes']} unseen episodes, every "
-        f"{config['evaluate_every']} updates), and the median of all draws.\n",
-        _row("model", ["loss", "median", *(f"`{name}`" for name in config["space"])]),
-        "| --- " * (3 + len(config["space"])) + "|",
-    ]
-    for model, chosen in record["best"].items():
-        drawn = [
-            f"{chosen['drawn'][name]:.2g}" if isinstance(chosen["drawn"][name], float) else str(chosen["drawn"][name])
-            for name in config["space"]
-        ]
-        lines.append(_row(f"`{model}`", [f"{chosen['loss']:.4f}", f"{chosen['median_loss']:.4f}", *drawn]))
-    return "\n".join(lines) + "\n"
-
-
-def _row(name: str, cells: Sequence[str]) -> str:
-    return "| " + " | ".join([name, *cells]) + " |"
+        f"{config['evaluate_every']} updates), and the median of all draws.\n\n"
+        f"{markdown_table(heads, (row(model, chosen) for model, chosen in record['best'].items()))}\n"
+    )
 
 
 def _root(config: SearchConfig, episodes: int, seed: int) -> Path:
