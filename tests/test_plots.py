@@ -59,11 +59,10 @@ def test_the_grid_shows_walls_door_and_goal():
     assert axes.get_xticks().tolist() == axes.get_yticks().tolist() == [1, 2, 3, 4]
 
 
-def test_five_panels_name_their_questions_and_what_came_of_them(policy, tmp_path):
+def test_five_panels_name_their_questions_and_what_came_of_them(policy):
     with few_draws():
         panels = gridworld.five_panels(policy)
     figure = draw_panels(panels)
-    figure.savefig(tmp_path / "five.png")
     *grids, colorbar = figure.axes
     assert len(grids) == 5
     for number, (axes, panel) in enumerate(zip(grids, panels, strict=True), start=1):
@@ -120,10 +119,9 @@ def test_trajectories_stay_in_their_cells():
     assert len(set(firsts)) == 3  # apart from each other
 
 
-def test_state_distributions_have_a_grid_for_each_step_with_its_probabilities(policy, tmp_path):
+def test_state_distributions_have_a_grid_for_each_step_with_its_probabilities(policy):
     answer = gridworld.predicted_states(policy)
     figure = state_distributions(answer)
-    figure.savefig(tmp_path / "states.png")
     *grids, colorbar = figure.axes
     titles = [axes.get_title() for axes in grids]
     assert titles == [f"s[{at}]" + "  shown" * (at in gridworld.SHOWN_STATES) for at in range(HORIZON)]
@@ -168,10 +166,9 @@ def expert_states(episodes):
     return np.stack([played.agent, played.key], axis=-1)[:, :HORIZON]
 
 
-def test_trajectories_have_a_grid_for_each_group(tmp_path):
+def test_trajectories_have_a_grid_for_each_group():
     states = expert_states(40)
     figure = trajectories({"one": states[:20], "two": states[20:]}, captions=["a", "b"], cell=0, most=15)
-    figure.savefig(tmp_path / "ways.png")
     one, two, colorbar = figure.axes
     assert [axes.get_title() for axes in (one, two)] == ["one", "two"]
     assert [axes.get_xlabel() for axes in (one, two)] == ["a", "b"]
@@ -187,7 +184,7 @@ def test_trajectories_have_a_grid_for_each_group(tmp_path):
     assert "the cell in question" not in legend_of(trajectories({"one": states}))
 
 
-def test_marginals_show_every_component_that_is_asked(policy, tmp_path):
+def test_marginals_show_every_component_that_is_asked(policy):
     states = torch.tensor(expert_states(1)).float()
     window = Window(
         {"s": states, "a": torch.zeros(1, HORIZON, 1), "rtg": torch.zeros(1, HORIZON, 2)},
@@ -195,7 +192,6 @@ def test_marginals_show_every_component_that_is_asked(policy, tmp_path):
     )
     answer = policy.infer(window, "s[1:8], a[:3] | s[0]")
     figure = marginals(answer, window)
-    figure.savefig(tmp_path / "marginals.png")
     *rows, colorbar = figure.axes
     assert [axes.get_ylabel() for axes in rows] == ["s: agent_cell", "s: key_cell", "a: direction"]
     assert rows[-1].get_xlabel() == "step"
