@@ -210,3 +210,14 @@ def test_five_steps_act_on_the_arm_as_the_page_says():
         cell = f"{100 * run['success']:.0f} ({100 * run['standard_error']:.0f}) | {run['episodes']}"
         seconds = f"{run['train_processor_seconds']:.0f} s"
         assert f"| {run['task']} | {run['seed']} | {cell} | {seconds} |" in PAGES["arm.md"]
+
+
+def test_one_model_acts_on_six_tasks_as_the_page_says():
+    runs = record("arm_six.json")["runs"]
+    mean = sum(run["success"] for run in runs) / len(runs)
+    error = (sum(run["standard_error"] ** 2 for run in runs)) ** 0.5 / len(runs)
+    cells = [(run["success"], run["standard_error"]) for run in runs] + [(mean, error)]
+    tasks = " | ".join(run["task"] for run in runs)
+    row = " | ".join(f"{100 * share:.0f} ({100 * spread:.0f})" for share, spread in cells)
+    assert f"| {tasks} | mean |" in PAGES["arm.md"]
+    assert f"| {row} |" in PAGES["arm.md"]
