@@ -31,7 +31,7 @@ from lerobot_unimask.networks.layers import by_component
 from lerobot_unimask.networks.losses import masked_losses
 
 EXPERTS = ("paper", "released")
-# Twenty masks that show little enough for many of 500,000 episodes to agree; four with the return.
+# Twenty masks that show little enough for many of a million episodes to agree; four with the return.
 QUESTIONS = (
     "s[:], a[:] |",
     "s[:], a[:] | s[0]",
@@ -148,7 +148,7 @@ def test_marginals_equal_enumeration(monkeypatch, expert, horizon, first, K):
 @pytest.mark.parametrize("expert", EXPERTS)
 def test_marginals_equal_the_shares_of_many_episodes(expert):
     """Each frequency within five of its standard errors (with some room for small counts), for twenty masks."""
-    episodes = Episodes(*(c.astype(np.int8) for c in rollout(500_000, np.random.default_rng(0), expert=expert)))
+    episodes = Episodes(*(c.astype(np.int8) for c in rollout(1_000_000, np.random.default_rng(0), expert=expert)))
     ones = np.ones(len(episodes.action))
     for number, text in enumerate(QUESTIONS):
         one = slice(number, number + 1)  # an episode, so that what is shown can happen
