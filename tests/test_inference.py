@@ -390,6 +390,16 @@ def test_a_mixtures_most_likely_value_is_its_highest_mode():
     assert mixture.log_prob(joint.most_likely[0, 1]) >= density.max()
 
 
+def test_acting_carries_out_the_median_of_a_mixture():
+    """Of each number: half of what may be lies below it. What is shown stays, what is neither is nothing."""
+    said, weights, means, scales = mixture_answer()
+    value = said.carried_out("s")
+    below = (weights.unsqueeze(-1) * torch.distributions.Normal(means, scales).cdf(value[0, 1])).sum(0)
+    torch.testing.assert_close(below, torch.full((3,), 0.5), atol=1e-4, rtol=0)
+    assert value[0, 0].tolist() == [7, 7, 7]
+    assert said.carried_out("a").isnan().all()
+
+
 # --- Values that a user gives ----------------------------------------------------------------------------------------
 
 GRID = make_factors(

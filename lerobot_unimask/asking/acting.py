@@ -194,7 +194,7 @@ def plan(
         values = draw_jointly(model, window, question, order="forward", generator=generator).values["a"]
     else:
         said = answer(model, window, question, memory.cache)
-        values = said.draw("a", generator) if drawn else said.most_likely("a")
+        values = said.draw("a", generator) if drawn else said.carried_out("a")
     return values[:, present : present + size]
 
 
@@ -238,7 +238,11 @@ def _one_by_one(
         for name in "sa":
             if not question.shown[name][0, step]:
                 said = answer(model, Window(values, window.valid), _history(question, present, step, name), cache)
-                values[name][:, step] = said.at(name, rows, step, drawn=drawn, generator=generator)
+                here = said.at(rows, step)
+                if drawn:
+                    values[name][:, step] = here.draw(name, generator)[:, 0]
+                else:
+                    values[name][:, step] = (here.carried_out(name) if name == "a" else here.most_likely(name))[:, 0]
     return values["a"]
 
 

@@ -109,8 +109,7 @@ def sample(
             redraw, given = here[:, step].nonzero().squeeze(-1), model.factors[name].given_size
             values[name][redraw, step, given:] = window.values[name][rows[redraw], step, given:]  # what is computed
             for _ in range(tries):
-                drawn = said.at(name, redraw, step, drawn=True, generator=generator)
-                values[name][redraw, step, :given] = drawn
+                values[name][redraw, step, :given] = said.at(redraw, step).draw(name, generator)[:, 0]
                 samples.drawn += len(redraw)
                 redraw = redraw[:0] if check is None else redraw[~check(_rows(values, redraw), _rows(shown, redraw))]
                 samples.rejected += len(redraw)
