@@ -148,7 +148,7 @@ class ContinuousDistribution:
 
     @property
     def carried_out(self) -> Tensor:
-        """(B, K, d), what acting does: the mean of a single Gaussian; of several the median of each number, by bisection.
+        """(B, K, d), what acting does: the mean of a single Gaussian; of several each number's median, by bisection.
 
         Note: Not the highest mode. Where a dataset's actions were clipped, a Gaussian as narrow as it may be stands on
             the limit, and is the highest mode by far with a twentieth of the weight (docs/experiments.md).
@@ -250,11 +250,9 @@ class Answer:
     def at(self, rows: Tensor, step: int) -> "Answer":
         """That of some windows, (n,) their numbers, at one step."""
         here = {name: [part.at(rows, step) for part in parts] for name, parts in self.distributions.items()}
-        cut = (
-            {name: tokens[rows, step : step + 1] for name, tokens in side.items()}
-            for side in (self.mask.shown, self.mask.asked)
-        )
-        return Answer(Mask(*cut), here)
+        shown = {name: tokens[rows, step : step + 1] for name, tokens in self.mask.shown.items()}
+        asked = {name: tokens[rows, step : step + 1] for name, tokens in self.mask.asked.items()}
+        return Answer(Mask(shown, asked), here)
 
     def _tokens(self, factor: str, parts: list[Tensor]) -> Tensor:
         """The outputs' values, (B, K, d) each, as tokens, (B, K, D)."""
