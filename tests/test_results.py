@@ -221,3 +221,13 @@ def test_one_model_acts_on_six_tasks_as_the_page_says():
     row = " | ".join(f"{100 * share:.0f} ({100 * spread:.0f})" for share, spread in cells)
     assert f"| {tasks} | mean |" in PAGES["arm.md"]
     assert f"| {row} |" in PAGES["arm.md"]
+
+
+def test_act_is_beside_it_as_the_page_says():
+    (act,) = record("arm_others.json")["runs"]
+    ours = record("arm_k5.json")["runs"][0]
+    assert act["train_processor_seconds"] == pytest.approx(ours["train_processor_seconds"], abs=0.5)
+    for run in (ours, act):
+        success = f"{100 * run['success']:.0f} ({100 * run['standard_error']:.0f})"
+        cells = f"{run['updates']:,} | {run['parameters']:,} | {success} | {run['acting_ms_per_episode_step']:.2f}"
+        assert f"| {cells} |" in PAGES["arm.md"]
