@@ -152,7 +152,6 @@ def test_the_ablation_command_in_short(root, tmp_path, capsys):
     config.write_text(f"""
 name: short
 variants:
-  both: {{}}
   plain: {{fine_inputs: false}}
   zeros: {{}}
 zero_hidden: zeros
@@ -171,7 +170,7 @@ output: {tmp_path / "out"}
     main(["paper", "ablation", f"--config_path={config}"])
     record = json.loads((tmp_path / "out" / "short.json").read_text())
     assert [(run["row"], run["context_length"]) for run in record["runs"]] == [
-        ("both", 4), ("plain", 4), ("zeros", 4), ("both", 6), ("plain", 6), ("zeros", 6),
+        ("plain", 4), ("zeros", 4), ("plain", 6), ("zeros", 6),
     ]  # fmt: skip
     for run in record["runs"]:
         assert run["steps"] == 2
@@ -184,9 +183,9 @@ output: {tmp_path / "out"}
         row: load_file(tmp_path / "out" / "checkpoints" / f"{row}-4-0" / "model.safetensors")[
             "network.embeddings.s.hidden"
         ]
-        for row in ("both", "zeros")
+        for row in ("plain", "zeros")
     }
-    assert hidden["both"].abs().min() > 0
+    assert hidden["plain"].abs().min() > 0
     assert hidden["zeros"].abs().max() == 0
     assert (tmp_path / "out" / "short.png").stat().st_size > 10_000
     assert "| plain, K = 6 |" in capsys.readouterr().out
