@@ -40,7 +40,7 @@ from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.data.episodes import first_windows, open_dataset, read_info
 from lerobot_unimask.language.masks import TASKS, parse, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
-from lerobot_unimask.records import markdown_table, versions, write_json
+from lerobot_unimask.records import commit, markdown_table, versions, write_json
 from lerobot_unimask.sharing import cards
 
 # --- Texts, values, files --------------------------------------------------------------------------------------------
@@ -259,7 +259,7 @@ ATTACKS: dict[str, tuple[Attack, int]] = {
     "pushes to a Hub at fault": (pushes, 40),
     "kills while building": (hindrances.killed_builds, 100),
     "kills while preparing": (hindrances.killed_prepares, 60),
-    "kills while training": (hindrances.killed_trainings, 20),
+    "kills while training": (hindrances.killed_trainings, 12),
     "kills while saving checkpoints": (hindrances.killed_saves, 100),
     "kills of studies": (hindrances.killed_studies, 20),
     "kills while pushing": (hindrances.killed_pushes, 30),
@@ -296,7 +296,8 @@ def attack(
             outcomes[kind] += 1
             losses += [lost] if lost else []
         tried = sum(outcomes.values())
-        found[name] = {"tried": tried, **outcomes, "lost": len(losses), "seconds": round(time.time() - began, 1)}
+        seconds = round(time.time() - began, 1)
+        found[name] = {"tried": tried, **outcomes, "lost": len(losses), "seconds": seconds, "commit": commit()}
         if losses:
             found[name]["losses"] = [str(loss)[:300] for loss in sorted(set(losses))[:10]]
         print(json.dumps({name: found[name]}), file=sys.stderr, flush=True)
