@@ -23,7 +23,7 @@ from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
-from lerobot_unimask.data.episodes import check_format
+from lerobot_unimask.data.episodes import check_format, check_home
 from lerobot_unimask.data.taking_over import keep_to
 from lerobot_unimask.sharing import hub
 
@@ -86,6 +86,7 @@ def _read_as_this_policy_needs() -> None:
                 "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
                 "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
             )
+        check_home()
         root = Path(cfg.dataset.root or "")
         if cfg.dataset.root and (root / "meta" / "info.json").exists():
             check_format(root)  # one that is old or damaged ends in one sentence

@@ -246,7 +246,7 @@ for word in [*commands, ";"]:
 
 def homes(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
     """Training, asking and preparing in a process of its own, whose home is absent, a file or read-only, or whose
-    locale is C: what works elsewhere works, in a folder with a name that is not ASCII."""
+    locale is C, in a folder with a name that is not ASCII: all of it works, or one sentence names the home."""
     readable = HOME / "read_only"
     readable.mkdir()
     readable.chmod(0o555)
@@ -261,7 +261,7 @@ def homes(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
         home = HOME / "a_file" if kind == "a file" else places.get(kind, HOME)
         environment = {**plain, "HOME": str(home), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
         if kind == "locale C":
-            environment |= {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+            environment |= {"LC_ALL": "C", "LANG": "C"}
         flags = [*TRAIN, f"--dataset.root={data}", f"--output_dir={work / 'run'}", "--save_freq=5"]
         asked = [
             "query",
@@ -275,4 +275,6 @@ def homes(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
         command = [sys.executable, "-c", SESSION, "lerobot-train", *flags, ";", *asked, ";", *made]
         done = subprocess.run(command, cwd=work, env=environment, capture_output=True, text=True, errors="replace")
         said = [line for line in done.stderr.splitlines() if line.strip()] or [""]
-        yield "refused" if done.returncode else "held", None if not done.returncode else f"{kind}: {said[-1]}"
+        clear = said[-1].startswith(("OSError", "ValueError")) and str(home) in said[-1]
+        lost = None if not done.returncode or (clear and kind != "absent") else f"{kind}: {said[-1]}"
+        yield "refused" if done.returncode else "held", lost

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import commands
+import datasets
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,6 +19,7 @@ from lerobot.policies.factory import make_policy
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig
 from lerobot_unimask.data import soundness
+from lerobot_unimask.data.episodes import open_dataset
 
 SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "device": "cpu", "push_to_hub": False}
 
@@ -152,6 +154,17 @@ def test_what_was_looked_through_covers_its_parts(root, monkeypatch):
     policy_of(root)
     monkeypatch.setattr(soundness, "_numbers", None)  # reading would fail
     policy_of_episodes(root, [1])
+
+
+def test_a_home_that_cannot_be_written_to_is_named(root, tmp_path, monkeypatch):
+    """LeRobot takes a dataset whose tables it cannot keep for one that is not there, and asks the Hub."""
+    (tmp_path / "home").write_text("a file")
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "home" / "datasets")
+    with pytest.raises(OSError, match="HF_HOME") as raised:
+        policy_of_episodes(root, None)
+    assert str(tmp_path / "home" / "datasets") in str(raised.value)
+    with pytest.raises(OSError, match="HF_HOME"):
+        open_dataset(UniMASKConfig(**SMALL), root)
 
 
 def test_rows_of_different_lengths_are_named(root):

@@ -4,11 +4,13 @@ Legend of shapes: B windows, K steps, E episodes.
 """
 
 import re
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any, NoReturn
 
+import datasets
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -45,6 +47,23 @@ def check_format(root: Path) -> None:
             f"{root} has LeRobot's format {version}, and LeRobot reads v3.0: `unimask prepare --dataset.root={root} "
             "--output=DIR` writes it anew."
         )
+
+
+def check_home() -> None:
+    """
+    Raises:
+        OSError: there is no place to write tables to. (LeRobot would take the dataset for one that is not there.)
+    """
+    folder = Path(datasets.config.HF_DATASETS_CACHE)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(
+            f"{folder} cannot be written to ({error.strerror}), and a dataset's tables are kept there: set HF_HOME or "
+            "HF_DATASETS_CACHE to a folder that can."
+        ) from error
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -118,6 +137,7 @@ def open_dataset(
     if root is not None:
         check_folder(root)
         check_format(root)
+    check_home()
     repo_id = repo_id or LOCAL
     meta = LeRobotDatasetMetadata(repo_id, root=root)
     deltas = resolve_delta_timestamps(config, meta)
