@@ -15,6 +15,7 @@ from lerobot_unimask.envs.doorkey.episodes import rollout
 from lerobot_unimask.envs.doorkey.rules import GOAL
 from lerobot_unimask.evaluating import rollout as evaluate
 from lerobot_unimask.pretrained import FOLDERS
+from lerobot_unimask.validation import foretold_properties
 
 ROOT = Path(__file__).parents[1]
 MOST = 4 * 2**20  # bytes
@@ -79,6 +80,10 @@ def test_doorkeys_answers_are_near_the_optimum():
     optimum, (distance,) = beside_optimum([policy], batch, list(TASKS), "paper")
     for task, apart in distance["divergence"].items():
         assert apart < 0.08 * optimum["expected_losses"][task] + 0.005, task
+    with torch.no_grad():
+        foretold = foretold_properties(policy, batch)["rtg"]
+    for said, exact in zip(foretold, optimum["foretold"]["rtg"], strict=True):
+        assert said["mean_absolute_error"] < 1.2 * exact["mean_absolute_error"], said["t"]
 
 
 def test_doorkeys_card_says_what_was_measured():
@@ -86,6 +91,8 @@ def test_doorkeys_card_says_what_was_measured():
     found = json.loads((ROOT / "docs/results/doorkey_pretrained.json").read_text())
     for task, apart in found["runs"][0]["divergence"].items():
         assert f"| `{task}` | {found['optimum']['expected_losses'][task]:.3f} | {apart:.3f} |" in card
+    drawn = json.loads((ROOT / "docs/results/doorkey_pretrained_questions.json").read_text())["backward"]["unchecked"]
+    assert f"{100 * drawn['possible_samples']:.1f} % are possible" in card
     rules = json.loads((ROOT / "docs/results/doorkey_pretrained_acts.json").read_text())["rules"]
     assert f"{rules['most_likely']['success']:.1%}".replace("%", " %") in card
     assert f"sampled ones return {rules['sampled']['mean_return']:.2f}" in card
