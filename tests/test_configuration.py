@@ -35,7 +35,7 @@ def parse(*arguments):
         ({"width": 10, "heads": 4}, r"width \(10\) must be a multiple of heads \(4\)"),
         ({"dropout": 1.0}, "dropout is 1.0"),
         ({"dropout": -0.1}, "dropout is -0.1"),
-        ({"loss_weights": {"rtg": 1.0}}, "loss_weights names rtg"),
+        ({"loss_weights": {"rtg": 1.0}, "ask_properties": False}, "loss_weights names rtg"),
         ({"training_masks": []}, "training_masks is empty"),
         ({"training_masks": {"past": -1.0}}, "weights are positive"),
     ],
