@@ -82,7 +82,7 @@ def one_by_one(dataset, indices):
 
 
 def assert_same(batch, expected):
-    assert type(batch) is dict
+    assert isinstance(batch, dict)
     assert list(batch) == list(expected)
     for key, value in expected.items():
         assert type(batch[key]) is type(value), key

@@ -66,10 +66,63 @@ class Windows(Sequence):
         )
 
 
+class Batch(dict):
+    """A batch like any other, whose columns go to another device together: one copy, where each column of its own would
+    be a wait. PyTorch's DataLoader calls `pin_memory` where it is to pin, and accelerate calls `to`."""
+
+    buffer: torch.Tensor | None = None  # bytes, of which the columns that were pinned are views
+    pinned: Mapping[str, torch.Tensor] | None = None
+
+    def pin_memory(self) -> "Batch":
+        """The columns side by side in memory that a GPU reads while the processor goes on."""
+        return self._side_by_side(pinned=True)
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
+        """Every tensor on a device; what is none stays as it is."""
+        if torch.device(device).type == "cpu":
+            return Batch({key: value.to(device) for key, value in self._tensors().items()} | self._others())
+        on_gpu = torch.device(device).type == "cuda"
+        beside = self if self._is_pinned() else self._side_by_side(pinned=on_gpu)
+        moved = beside.buffer.to(device, non_blocking=on_gpu)  # of memory that is pinned and not written to again
+        return beside._views(moved)
+
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        return {key: value for key, value in self.items() if isinstance(value, torch.Tensor)}
+
+    def _others(self) -> dict[str, Any]:
+        return {key: value for key, value in self.items() if not isinstance(value, torch.Tensor)}
+
+    def _is_pinned(self) -> bool:
+        """Whether the columns are those that were pinned, and nobody has replaced one."""
+        tensors, pinned = self._tensors(), self.pinned or {}
+        return bool(pinned) and tensors.keys() == pinned.keys() and all(tensors[key] is pinned[key] for key in pinned)
+
+    def _side_by_side(self, *, pinned: bool) -> "Batch":
+        """The batch with its tensors as views of one buffer."""
+        sizes = [-(-value.nbytes // ALIGNED) * ALIGNED for value in self._tensors().values()]
+        batch = self._views(torch.empty(sum(sizes), dtype=torch.uint8, pin_memory=pinned))
+        batch.pinned = batch._tensors()
+        for key, value in batch.pinned.items():
+            value.copy_(self[key])
+        return batch
+
+    def _views(self, buffer: torch.Tensor) -> "Batch":
+        """The batch with its tensors, of their shapes, in a buffer that holds one after another."""
+        batch, start = Batch(self), 0
+        for key, value in self._tensors().items():
+            batch[key] = buffer[start : start + value.nbytes].view(value.dtype).view(value.shape)
+            start += -(-value.nbytes // ALIGNED) * ALIGNED
+        batch.buffer = buffer
+        return batch
+
+
+ALIGNED = 64  # bytes; a GPU's kernels read from multiples of 16
+
+
 def collate_windows(batch: Sequence[Item], *, collate_fn_map: dict | None = None) -> dict:
     """What default_collate does with a batch whose first item is an `Item`: nothing, if it was gathered as a batch."""
     if isinstance(batch, Windows) and batch.unchanged():
-        return dict(batch.batch)
+        return Batch(batch.batch)
     return collate([dict(item) for item in batch], collate_fn_map=collate_fn_map)
 
 
@@ -89,9 +142,20 @@ class Column:
 
     def take(self, rows: np.ndarray, piece: np.ndarray) -> np.ndarray:
         """(...) rows, none outside the table, and the piece that each is in -> (..., *shape), a copy."""
+        return self._from(rows, piece, 1).reshape(*rows.shape, *self.shape)
+
+    def take_runs(self, rows: np.ndarray, piece: np.ndarray, length: int) -> np.ndarray:
+        """`length` rows from each of (B,) on, all in one piece -> (B, length, *shape), a copy."""
+        return self._from(rows, piece, length).reshape(len(rows), length, *self.shape)
+
+    def _from(self, rows: np.ndarray, piece: np.ndarray, length: int) -> np.ndarray:
+        """The numbers of `length` rows from each of (...) on: (..., length * size), a copy. Read as runs and not number
+        by number, which takes several times as long."""
         size = math.prod(self.shape)
-        first = self.offsets[piece] + rows * size
-        return self.numbers[first[..., None] + np.arange(size)].reshape(*rows.shape, *self.shape)
+        starts = self.offsets[piece] + rows * size
+        step, width = self.numbers.itemsize, length * size
+        runs = np.ndarray((self.numbers.size - width + 1, width), self.numbers.dtype, self.numbers, 0, (step, step))
+        return runs[starts]
 
 
 @dataclass(frozen=True)
@@ -232,6 +296,57 @@ def serve_frames(dataset: LeRobotDataset, cameras: Sequence[str], size: tuple[in
     _frames[dataset] = {key: cached_frames(dataset, key, size) for key in cameras}
 
 
+@dataclass(frozen=True)
+class Steps:
+    """Which frames make up B windows of K steps."""
+
+    rows: np.ndarray  # (B, K)
+    padded: np.ndarray  # (B, K): outside the episode
+    whole: np.ndarray  # (B,): the window's frames follow each other in one piece
+    pieces: np.ndarray  # (B,) of its first frame
+    others: np.ndarray  # (B', K), pieces of the frames of windows that are not whole
+
+    def of(self, column: Column) -> np.ndarray:
+        """(B, K, *shape) of a column."""
+        whole, length = self.whole, self.rows.shape[1]
+        if whole.all():
+            return column.take_runs(self.rows[:, 0], self.pieces, length)
+        taken = np.empty((*self.rows.shape, *column.shape), column.numbers.dtype)
+        taken[whole] = column.take_runs(self.rows[whole, 0], self.pieces[whole], length)
+        taken[~whole] = column.take(self.rows[~whole], self.others)
+        return taken
+
+
+def _steps(
+    columns: Columns,
+    reader: DatasetReader,
+    rows: np.ndarray,
+    index: np.ndarray,
+    wanted: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+) -> Steps:
+    """The frames of windows around `rows` (B,), whose `index`, (B, 1), counts over all episodes, as do the `wanted`
+    frames, (B, K), of which those outside the window's episode, `start` to `end`, (B, 1), become its nearest.
+
+    Raises:
+        KeyError: as `gather`.
+    """
+    absolute = wanted.clip(start, end - 1)
+    taken = absolute
+    if reader.episodes is not None:  # some episodes are loaded, each of them frame after frame
+        taken = (rows[:, None] + absolute - index).clip(0, len(columns) - 1)
+    first, last = columns.pieces_of(taken[:, 0]), columns.pieces_of(taken[:, -1])
+    whole = (first == last) & (taken[:, 1:] == taken[:, :-1] + 1).all(1)
+    steps = Steps(taken, wanted != absolute, whole, first, columns.pieces_of(taken[~whole]))
+    if reader.episodes is not None and (steps.of(columns.columns["index"]) != absolute).any():
+        raise KeyError(
+            "a window reaches a frame of its episode that is not loaded, or not in its place; "
+            "UNIMASK_PATCH_LEROBOT=0 reads frames one by one, wherever they are"
+        )
+    return steps
+
+
 def gather(
     columns: Columns,
     reader: DatasetReader,
@@ -263,29 +378,19 @@ def gather(
         for key, deltas in (reader.delta_indices or {}).items()
         if key in columns.columns or key in frames  # not of a camera that nobody reads
     }
-    steps = {}  # deltas -> rows (B, K), their pieces (B, K), padded (B, K); keys mostly share their deltas
-    for deltas in set(deltas_of.values()):
-        wanted = index + np.array(deltas)  # (B, K), absolute: counted over all episodes
-        absolute = wanted.clip(start, end - 1)
-        taken = absolute
-        if reader.episodes is not None:  # some episodes are loaded, each of them frame after frame
-            taken = (rows[:, None] + absolute - index).clip(0, size - 1)
-            if (columns.columns["index"].take(taken, columns.pieces_of(taken)) != absolute).any():
-                raise KeyError(
-                    "a window reaches a frame of its episode that is not loaded, or not in its place; "
-                    "UNIMASK_PATCH_LEROBOT=0 reads frames one by one, wherever they are"
-                )
-        steps[deltas] = taken, columns.pieces_of(taken), wanted != absolute
-
+    steps = {  # keys mostly share their deltas
+        deltas: _steps(columns, reader, rows, index, index + np.array(deltas), start, end)
+        for deltas in set(deltas_of.values())
+    }
     batch: dict[str, Any] = {
-        key: torch.from_numpy(np.asarray(pictures[steps[deltas_of[key]][0] if key in deltas_of else rows]))
+        key: torch.from_numpy(np.asarray(pictures[steps[deltas_of[key]].rows if key in deltas_of else rows]))
         for key, pictures in frames.items()
     }
     for key, column in columns.columns.items():
-        where = steps[deltas_of[key]][:2] if key in deltas_of else (rows, pieces)
-        batch[key] = torch.from_numpy(column.take(*where)).to(column.dtype)
+        taken = steps[deltas_of[key]].of(column) if key in deltas_of else column.take(rows, pieces)
+        batch[key] = torch.from_numpy(taken).to(column.dtype)
     for key, deltas in deltas_of.items():
-        batch[f"{key}_is_pad"] = torch.tensor(steps[deltas][2])  # each key its own copy, should somebody write to it
+        batch[f"{key}_is_pad"] = torch.tensor(steps[deltas].padded)  # each key its own copy, should somebody write to it
     batch["task"] = columns.tasks[batch["task_index"].numpy()].tolist()
     return Windows(batch, len(rows))
 
