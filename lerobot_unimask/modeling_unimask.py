@@ -96,7 +96,8 @@ class UniMASKPolicy(PreTrainedPolicy):
             predicted=config.predicted(self.factors),
         )
         self.network = make_network(config, self.factors, load_backbone=load_backbone)
-        self._batch_loss = CapturedLoss() if config.compile_model else batch_loss
+        captured = CapturedLoss(required=bool(config.compile_model))
+        self._batch_loss = batch_loss if config.compile_model is False else captured
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))  # made so far; training masks depend on it
         self._held_out = HeldOutActions()  # since it was last trained
         self._loss: Tensor | None = None  # of the last batch that was trained on
@@ -142,10 +143,10 @@ class UniMASKPolicy(PreTrainedPolicy):
         step, index = self.updates if self.training else VALIDATION_STEP, frame_index(batch, window)
         loss, losses = self._batch_loss(self, window, index, step, reduction)
         if self.training:
-            self._loss = loss.detach().mean()
+            self._loss = _mean(loss)
         else:
             self._held_out.add(self, window, index)
-        return loss, LossParts({f"loss_{name}": part.detach().mean() for name, part in losses.items()})
+        return loss, LossParts({f"loss_{name}": _mean(part) for name, part in losses.items()})
 
     def train(self, mode: bool = True) -> "UniMASKPolicy":
         """As PyTorch's; on a processor, training begins with glibc told to keep freed memory, and with threads
@@ -438,3 +439,8 @@ class UniMASKPolicy(PreTrainedPolicy):
         check_weights(weights, model.state_dict(), model_file)
         model.load_state_dict(weights)
         return model
+
+
+def _mean(loss: Tensor) -> Tensor:
+    """The mean of a loss for each window, or the one loss, without its graph."""
+    return loss.detach().mean() if loss.ndim else loss.detach()

@@ -1,16 +1,20 @@
 """What training minimises: from a window to its loss, captured by torch.compile where the config says so."""
 
 import functools
+import logging
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
 from lerobot_unimask.networks.losses import masked_losses
 
+logger = logging.getLogger(__name__)
+
+EAGER = 200  # updates before the first that is captured where nobody requires it
 Losses = tuple[Tensor, dict[str, Tensor]]  # the loss, and each factor's part in it
 
 
@@ -39,19 +43,60 @@ class CapturedLoss:
 
     On a GPU the capture is replayed as CUDA graphs, one for the forward and one for the backward pass. The policy stays
     as it is, so its checkpoints are the same files.
+
+    Args:
+        required: whether updates are captured from the first one on, on any device, and an error ends the training.
+            Otherwise they are on a GPU, once there have been `EAGER`, for a short training ends before a capture pays;
+            not of cameras, nor in one of several processes; and an error is logged, and updates run eagerly.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, required: bool) -> None:
+        self.required = required
         self.size: int | None = None  # windows of a batch
+        self.seen = 0  # batches of that size
+        self.rehearsed = self.failed = False
 
     def __call__(self, policy: Any, window: Window, index: Tensor, step: Tensor | int, reduction: str) -> Losses:
-        if not policy.training or reduction != "mean" or self.size not in (None, len(window.valid)):
-            return batch_loss(policy, window, index, step, reduction)
-        self.size = len(window.valid)
+        if policy.training and reduction == "mean":
+            self.size = self.size or len(window.valid)
+            if self.size == len(window.valid):
+                self.seen += 1
+                if self._captures(policy, window):
+                    return self._replay(policy, window, index, step)
+        return batch_loss(policy, window, index, step, reduction)
+
+    def _captures(self, policy: Any, window: Window) -> bool:
+        if self.required or self.failed:
+            return self.required
+        alone = not (distributed.is_available() and distributed.is_initialized())
+        return window.valid.device.type == "cuda" and alone and not policy.cameras and self.seen > EAGER
+
+    def _replay(self, policy: Any, window: Window, index: Tensor, step: Tensor | int) -> Losses:
         on_gpu = window.valid.device.type == "cuda"
-        loss, losses = _captured("reduce-overhead" if on_gpu else "default")(policy, window, index, step)
+        captured = _captured("reduce-overhead" if on_gpu else "default")
+        try:
+            if not self.required and not self.rehearsed:
+                _rehearse(captured, policy, window, index, step)
+                self.rehearsed = True
+            loss, losses = captured(policy, window, index, step)
+        except Exception as error:
+            if self.required:
+                raise
+            self.failed = True
+            logger.warning("Updates are not captured, and run as they did before: %s", str(error).split("\n")[0])
+            return batch_loss(policy, window, index, step)
         # A graph's next replay overwrites its outputs.
         return (loss.clone(), {name: part.clone() for name, part in losses.items()}) if on_gpu else (loss, losses)
+
+
+def _rehearse(captured: Callable[..., Losses], policy: Any, window: Window, index: Tensor, step: Tensor | int) -> None:
+    """Forth and back until CUDA graphs have been warmed up, recorded and replayed: what fails, fails here, where
+    updates can still go on eagerly."""
+    weights = [weight for weight in policy.parameters() if weight.requires_grad]
+    for _ in range(3):
+        loss, _ = captured(policy, window, index, step)
+        with torch.autocast(window.valid.device.type, enabled=False):
+            torch.autograd.grad(loss, weights, allow_unused=True)
 
 
 @functools.cache

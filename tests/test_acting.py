@@ -355,7 +355,7 @@ def test_a_question_changed_in_the_settings_takes_effect_at_the_next_step(tiny_p
 @pytest.mark.parametrize("attention", ["both", "causal", "bidirectional"])
 def test_what_a_sliding_window_keeps_changes_no_action(attention, tiny_policy):
     policy = tiny_policy("gaussian", context_length=6, attention=attention, training_masks="behavior_cloning")
-    states, actions = Episode("gaussian", 3, 16).states, []
+    states, actions = Episode("gaussian", 8, 16).states, []
     for keeps in (True, False):
         policy.reset()
         for step, state in enumerate(states):

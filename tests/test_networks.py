@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch import nn
 
 from lerobot_unimask.data.factors import Feature, make_factors
 from lerobot_unimask.data.window import Window
@@ -354,6 +355,17 @@ def test_a_rollouts_cache_changes_no_prediction_and_computes_each_token_once(kin
     for x, y in zip(kept, anew, strict=True):
         torch.testing.assert_close(x[:, K - 1], y[:, K - 1])
     assert counted[-2] == properties + 2 * K - 1
+
+
+@pytest.mark.parametrize("windows", [1, 5])
+def test_the_last_token_of_a_block_needs_no_keys_and_values_of_the_others(windows):
+    block = Block(24, 3, 48, 0.1).eval()
+    x = torch.randn(windows, 7, 24)
+    expected = block(x, torch.ones(7, 7, dtype=torch.bool).tril(), None)[0][:, -1:]
+    torch.testing.assert_close(block.last(x), expected, rtol=1e-5, atol=1e-6)
+    block.query_key_value = nn.Sequential(block.query_key_value, nn.Linear(72, 72))  # as an adapter wraps it
+    expected = block(x, None, None)[0][:, -1:]
+    torch.testing.assert_close(block.last(x), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_mixed_precision_answers_in_full_precision(kind):

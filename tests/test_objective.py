@@ -8,6 +8,7 @@ import traceback
 import pytest
 import torch
 from policies import CONTINUOUS_FEATURES
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from lerobot_unimask import objective
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
@@ -107,15 +108,64 @@ def test_a_loss_is_one_graph(tiny_policy, batch_of, capture):
     assert len(graphs) == 1
 
 
+@pytest.fixture
+def on_gpu(tiny_policy, batch_of):
+    """A policy and a batch on a GPU that is not there: PyTorch's fake tensors have devices and shapes, and refuse two
+    devices at once and whatever a processor would have to wait for."""
+    overwrites = torch.__future__.get_overwrite_module_params_on_conversion()
+    torch.__future__.set_overwrite_module_params_on_conversion(True)
+    policy = tiny_policy("gaussian", dropout=0.1)
+    batch = {key: value for key, value in batch_of("gaussian").items() if isinstance(value, torch.Tensor)}
+    with FakeTensorMode() as mode:
+        policy._apply(lambda tensor: mode.from_tensor(tensor).to("cuda"))
+        yield policy.train(), {key: mode.from_tensor(value).to("cuda") for key, value in batch.items()}
+    torch.__future__.set_overwrite_module_params_on_conversion(overwrites)
+
+
+@torch.no_grad()
+def test_on_a_gpu_a_loss_is_one_graph_of_that_gpus_tensors(on_gpu, capture):
+    graphs = capture("eager")
+    policy, batch = on_gpu
+    policy._batch_loss.required = True
+    assert policy(batch)[0].device.type == "cuda"
+    (graph,) = graphs
+    values = [node.meta.get("example_value") for node in graph.graph.nodes]
+    devices = {value.device.type for value in values if isinstance(value, torch.Tensor)}
+    assert devices == {"cuda"}
+
+
+@torch.no_grad()
+def test_on_a_gpu_updates_are_captured_once_there_have_been_some_and_an_error_ends_that(on_gpu, monkeypatch, caplog):
+    policy, batch = on_gpu
+    tried = []
+
+    def fail(*_):
+        tried.append(policy._batch_loss.seen)
+        raise RuntimeError("no compiler\nand more")
+
+    monkeypatch.setattr(objective, "EAGER", 2)
+    monkeypatch.setattr(objective, "_captured", lambda mode: fail)
+    for _ in range(5):
+        assert policy(batch)[0].device.type == "cuda"
+    policy(batch, reduction="none")
+    assert tried == [3]
+    assert caplog.messages == ["Updates are not captured, and run as they did before: no compiler"]
+
+
 @pytest.mark.slow
 @alone
-def test_a_batch_that_does_not_fit_runs_eagerly(tiny_policy, batch_of, capture):
+def test_a_batch_that_does_not_fit_runs_eagerly(tiny_policy, batch_of, capture, monkeypatch):
+    """Captured as on a GPU where nobody requires it: after a rehearsal, which changes nothing."""
     graphs = capture("eager")
+    monkeypatch.setattr(objective.CapturedLoss, "_captures", lambda *_: True)
     batch = batch_of("doorkey")
     small = {key: value[:3] for key, value in batch.items()}
     captured, eager = pair(tiny_policy, "doorkey")
+    captured._batch_loss.required = False
     batches = [batch, small, batch]
     torch.testing.assert_close(updates(captured, batches), updates(eager, batches), rtol=1e-4, atol=1e-4)
+    assert captured._batch_loss.rehearsed
+    assert not captured._batch_loss.failed
     assert len(graphs) == 1
     each, _ = captured(batch, reduction="none")
     assert each.shape == (len(batch["index"]),)

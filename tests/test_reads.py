@@ -232,7 +232,34 @@ def test_windows_survive_pinning_uncollated(root, monkeypatch):
     pinned = pin_memory(dataset.__getitems__([11, 40]))
     assert [type(item) for item in pinned] == [Item, Item]
     assert_same(default_collate(pinned), one_by_one(dataset, [11, 40]))
-    assert_same(pin_memory(default_collate(dataset.__getitems__([11, 40]))), one_by_one(dataset, [11, 40]))
+
+
+def test_a_batch_moves_in_one_copy(root, monkeypatch):
+    copies = []
+    copy_to = torch.Tensor.to
+
+    def to(tensor, *arguments, **keywords):
+        copies.append(tensor.dtype)
+        return copy_to(tensor, *arguments, **keywords)
+
+    dataset = load(root)
+    batch = default_collate(dataset.__getitems__([11, 40, 3]))
+    beside = batch._side_by_side(pinned=False)
+    assert_same(beside, batch)
+    assert all(value.data_ptr() % 16 == 0 for value in beside.values() if isinstance(value, torch.Tensor))
+    assert beside._is_pinned()
+    monkeypatch.setattr(torch.Tensor, "to", to)
+    moved = beside.to("meta")
+    assert copies == [torch.uint8]
+    assert {key: value.shape for key, value in moved.items() if key != "task"} == {
+        key: value.shape for key, value in batch.items() if key != "task"
+    }
+    assert moved["task"] == batch["task"]
+    assert_same(beside._views(beside.buffer.clone()), batch)
+    changed = beside["action"] = -beside["action"]
+    assert not beside._is_pinned()
+    assert torch.equal(beside._side_by_side(pinned=False)["action"], changed)
+    assert_same(batch.to("cpu"), batch)
 
 
 def assert_read_item_by_item(dataset):

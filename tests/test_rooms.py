@@ -97,6 +97,8 @@ FLOORS = [
     "lerobot_unimask/bench/clock.py",
     "lerobot_unimask/bench/measuring.py",
     "lerobot_unimask/bench/device.py",
+    "lerobot_unimask/bench/contender.py",
+    "lerobot_unimask/bench/beside.py",
     "lerobot_unimask/bench/tables.py",
     "lerobot_unimask/demo.py",
     "lerobot_unimask/paper/study_tables.py",

@@ -178,22 +178,26 @@ def plan(
             here["rtg", 0] = memory.remaining(target.to(model.device))
     window, known = give(memory.window(model.statistics.horizon), here, memory.known())
     memory.carry_return(window)
-    question = table.at(present, len(memory.valid))
-    for token in tokens:  # a moment of the episode is shown once the window reaches it
-        position = token.step - memory.first_step
-        if token.of_episode and (token.factor, position) in here:
-            question.shown[token.factor][:, position] = True
-            question.asked[token.factor][:, position] = False
-    _ask_chunk(question, window, known, present, size, prefix)
-    check_known(question, known, text)
-    question = question.to(model.device)
+    moments = {(token.factor, token.step - memory.first_step) for token in tokens if token.of_episode} & here.keys()
+    posed = text, present, size, moments, set(here)
+    question = memory.question if memory.posed == posed and prefix is None else None
+    if question is None:
+        question = table.at(present, len(memory.valid))
+        for name, position in moments:  # a moment of the episode is shown once the window reaches it
+            question.shown[name][:, position] = True
+            question.asked[name][:, position] = False
+        _ask_chunk(question, window, known, present, size, prefix)
+        check_known(question, known, text)
+        question = question.to(model.device)
+        memory.posed, memory.question = posed, question
     drawn = config.sample_actions if sample is None else sample
-    if size > 1 and _follow_on(model, question, present, size):
+    memory.cache.grows = size > 1 and _follow_on(model, question, present, size)
+    if memory.cache.grows:
         values = _one_by_one(model, window, question, present, size, memory.cache, drawn, generator)
     elif size > 1 and drawn:
         values = draw_jointly(model, window, question, order="forward", generator=generator).values["a"]
     else:
-        said = answer(model, window, question, memory.cache)
+        said = answer(model, window, question, memory.cache, factors=["a"])
         values = said.draw("a", generator) if drawn else said.carried_out("a")
     return values[:, present : present + size]
 
@@ -237,8 +241,8 @@ def _one_by_one(
     for step in range(present, present + size):
         for name in "sa":
             if not question.shown[name][0, step]:
-                said = answer(model, Window(values, window.valid), _history(question, present, step, name), cache)
-                here = said.at(rows, step)
+                asked = _history(question, present, step, name)
+                here = answer(model, Window(values, window.valid), asked, cache, [name]).at(rows, step)
                 if drawn:
                     values[name][:, step] = here.draw(name, generator)[:, 0]
                 else:

@@ -6,7 +6,7 @@ Legend of shapes: B windows, K steps, D the numbers of a factor, d those of one 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -265,16 +265,19 @@ class Answer:
         )
 
 
-def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None) -> Answer:
+def answer(
+    model: Model, window: Window, mask: Mask, cache: Cache | None = None, factors: Sequence[str] | None = None
+) -> Answer:
     """The distribution of every asked token given the shown ones.
 
     Args:
         window: values in the dataset's units.
         cache: what the rollout that asks has computed before.
+        factors: those that anybody will look at; None: `s` and `a`.
     """
     predictions = model.predict(model.statistics.normalise(window), mask, cache)
     distributions: dict[str, list[Distribution]] = {}
-    for name in predictions:
+    for name in predictions if factors is None else factors:
         if name not in ASKABLE and not mask.asked[name].any():
             continue
         shown = mask.shown[name].unsqueeze(-1)
@@ -290,8 +293,8 @@ def answer(model: Model, window: Window, mask: Mask, cache: Cache | None = None)
                 distributions[name].append(DiscreteDistribution(output, probabilities))
             else:
                 weights, means, scales = model.statistics.denormalise(name, output, prediction)
-                first = torch.zeros_like(weights).index_fill_(-1, torch.tensor(0, device=weights.device), 1.0)
-                weights = torch.where(known, torch.where(shown, first, weights), torch.nan)
+                first = torch.arange(weights.shape[-1], device=weights.device) == 0
+                weights = torch.where(known, torch.where(shown, first.to(weights.dtype), weights), torch.nan)
                 value = window.values[name][..., output.dims].unsqueeze(-2)
                 here, there = shown.unsqueeze(-1), known.unsqueeze(-1)  # (B, K, 1, 1)
                 means = torch.where(there, torch.where(here, value, means), torch.nan)

@@ -4,13 +4,14 @@ Legend of shapes: B environments, K steps, D the numbers of a factor.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
-from lerobot_unimask.language.masks import ASKABLE
+from lerobot_unimask.language.masks import ASKABLE, Mask
 from lerobot_unimask.networks.layers import Cache
 
 
@@ -50,6 +51,8 @@ class RolloutMemory:
         self.planned: list[Tensor] = []  # actions of a chunk that are still to be carried out, each (B, D)
         self.valid = torch.ones(batch_size, K, dtype=torch.bool, device=device)
         self.cache = Cache()  # of the steps in the window
+        self.posed: tuple[Any, ...] | None = None  # what the last question was made of, and
+        self.question: Mask | None = None  # the same again while the window slides
 
     @property
     def position(self) -> int:

@@ -49,9 +49,14 @@ def predict(model: Learnt, window: Window, mask: Mask, cache: Cache | None = Non
         MaskError: the model attends causally alone and has not learnt to answer this, or asks for what it does not
             predict.
     """
-    network, causally = model.network, model.training_masks.answered_causally(mask)
+    network = model.network
+    if cache is not None and cache.question is mask:
+        return network(window, mask.shown, True, cache, mask.asked)
+    causally = model.training_masks.answered_causally(mask)
     check_predicted(mask, model.config.predicted(mask.asked))
     if all(torch.equal(causally[name], asked) for name, asked in mask.asked.items()):
+        if cache is not None:
+            cache.question = mask
         return network(window, mask.shown, True, cache, mask.asked)
     if model.config.attention == "causal":
         raise MaskError(

@@ -82,6 +82,7 @@ def bench_device(configs: Path, device: str, *, quick: bool = False) -> dict[str
         "updates": {},
         "acting": {},
         "left_out": [],
+        "failed": {},
     }
     with tempfile.TemporaryDirectory() as folder:
         roots = {name: Path(folder) / name for name in CONFIGS}
@@ -89,10 +90,14 @@ def bench_device(configs: Path, device: str, *, quick: bool = False) -> dict[str
         build_maze2d(roots["maze2d"], episodes=size.episodes, progress=False)
         settings = yaml.safe_load((configs / CONFIGS["maze2d"]).read_text())["policy"] | {"device": device}
         for kind, name, count, measure in _measurements(size, configs, roots, settings, device):
+            label = f"{kind}, {name}, {count}"
             if device.startswith("cuda") and time.monotonic() - began > size.seconds:
-                record["left_out"].append(f"{kind}, {name}, {count}")
-            else:
-                record[kind].setdefault(name, {})[str(count)] = alone(f"{kind}, {name}, {count}", measure)
+                record["left_out"].append(label)
+                continue
+            try:
+                record[kind].setdefault(name, {})[str(count)] = alone(label, measure)
+            except Exception as error:  # the others are worth having all the same
+                record["failed"][label] = str(error).strip().split("\n")[0]
     record["seconds"] = round(time.monotonic() - began)
     return record
 
@@ -102,9 +107,9 @@ def _measurements(
 ) -> Iterator[tuple[str, str, int, Callable[[], dict[str, Any]]]]:
     """Kind, name, number of windows or environments, and what measures it; the most important first."""
     how = {
-        "eager, float32": ["--policy.use_amp=false"],
+        "eager, float32": ["--policy.use_amp=false", "--policy.compile_model=false"],
         "captured, float32": ["--policy.use_amp=false", "--policy.compile_model=true"],
-        "eager, use_amp": ["--policy.use_amp=true"],
+        "eager, use_amp": ["--policy.use_amp=true", "--policy.compile_model=false"],
         "captured, use_amp": ["--policy.use_amp=true", "--policy.compile_model=true"],
     }
 
@@ -270,4 +275,6 @@ def markdown(record: Mapping[str, Any]) -> str:
         lines.append(f"| {name} | {' | '.join(cells)} |")
     if record["left_out"]:
         lines += ["", f"Left out for want of time: {'; '.join(record['left_out'])}."]
+    if record["failed"]:
+        lines += ["", *(f"Failed: {label}: {error}" for label, error in record["failed"].items())]
     return "\n".join(lines)

@@ -3,6 +3,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from lerobot_unimask.records import markdown_table
+
 
 def targets(record: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
     """What was promised: the quantity, its bound, what was measured, and whether it keeps the bound."""
@@ -112,3 +114,19 @@ def _text(found: Mapping[str, Any]) -> str:
 def _number(value: float) -> str:
     """Three digits."""
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+
+
+def beside(record: Mapping[str, Any]) -> str:
+    """The table of `unimask bench --beside`: of each model the median, the least, and its share of what this package
+    took before, or takes."""
+    names = list(dict.fromkeys(name for found in record["ms"].values() for name in found))
+    rows = []
+    for title, found in record["ms"].items():
+        whole = found.get("before", found["unimask"])["median"]
+        cells = {
+            name: f"{one['median']:.1f} ({one['least']:.1f}), {one['median'] / whole:.2f}"
+            for name, one in found.items()
+        }
+        rows.append((title, *(cells.get(name) for name in names)))
+    heads = (name.replace("_", " ") for name in names)
+    return markdown_table((f"processor ms{', AVX2' if record['avx2'] else ''}: median (least), ratio", *heads), rows)

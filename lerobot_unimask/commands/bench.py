@@ -15,21 +15,34 @@ def add(commands: Any) -> None:
         "--device", metavar="DEVICE", help="only updates and actions, on this device (cuda), in eight minutes on a GPU"
     )
     parser.add_argument(
+        "--beside",
+        dest="light",  # what it measures loads what it needs in processes of its own
+        action="store_true",
+        help="only processor time, beside models of the same size",
+    )
+    parser.add_argument("--before", type=Path, metavar="DIR", help="with --beside: an older checkout, one more model")
+    parser.add_argument("--avx2", action="store_true", help="with --beside: compute as if there were nothing newer")
+    parser.add_argument(
         "--output",
         type=Path,
         required=True,
         metavar="FILE.json",
-        help="the record; without --device a picture goes beside it",
+        help="the record; without --device or --beside a picture goes beside it",
     )
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.bench.measuring import bench
-    from lerobot_unimask.bench.tables import markdown
-    from lerobot_unimask.plots.growth import cost_of_growth
+    from lerobot_unimask.bench import tables
     from lerobot_unimask.records import write_json
 
+    if arguments.light:
+        from lerobot_unimask.bench import beside
+
+        record = beside.bench_beside(arguments.before, avx2=arguments.avx2)
+        write_json(arguments.output, {**record, "command": arguments.text})
+        print(tables.beside(record))
+        return
     if arguments.device:
         from lerobot_unimask.bench import device
 
@@ -37,8 +50,11 @@ def _run(arguments: argparse.Namespace) -> None:
         write_json(arguments.output, {**record, "command": arguments.text})
         print(device.markdown(record))
         return
+    from lerobot_unimask.bench.measuring import bench
+    from lerobot_unimask.plots.growth import cost_of_growth
+
     record = bench(arguments.configs, quick=arguments.quick)
-    print(markdown(record))
+    print(tables.markdown(record))
     write_json(arguments.output, {**record, "command": arguments.text})
     picture = arguments.output.with_suffix(".png")
     cost_of_growth(record).savefig(picture, dpi=200)

@@ -83,6 +83,7 @@ class Batch(dict):
             return Batch({key: value.to(device) for key, value in self._tensors().items()} | self._others())
         on_gpu = torch.device(device).type == "cuda"
         beside = self if self._is_pinned() else self._side_by_side(pinned=on_gpu)
+        assert beside.buffer is not None
         moved = beside.buffer.to(device, non_blocking=on_gpu)  # of memory that is pinned and not written to again
         return beside._views(moved)
 
@@ -154,7 +155,11 @@ class Column:
         size = math.prod(self.shape)
         starts = self.offsets[piece] + rows * size
         step, width = self.numbers.itemsize, length * size
-        runs = np.ndarray((self.numbers.size - width + 1, width), self.numbers.dtype, self.numbers, 0, (step, step))
+        if not starts.size:  # there may be fewer numbers than a run has
+            return np.empty((*starts.shape, width), self.numbers.dtype)
+        runs: np.ndarray = np.ndarray(
+            (self.numbers.size - width + 1, width), self.numbers.dtype, self.numbers, 0, (step, step)
+        )
         return runs[starts]
 
 
@@ -390,7 +395,7 @@ def gather(
         taken = steps[deltas_of[key]].of(column) if key in deltas_of else column.take(rows, pieces)
         batch[key] = torch.from_numpy(taken).to(column.dtype)
     for key, deltas in deltas_of.items():
-        batch[f"{key}_is_pad"] = torch.tensor(steps[deltas].padded)  # each key its own copy, should somebody write to it
+        batch[f"{key}_is_pad"] = torch.tensor(steps[deltas].padded)  # a copy for each key
     batch["task"] = columns.tasks[batch["task_index"].numpy()].tolist()
     return Windows(batch, len(rows))
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_unimask.data.factors import Factor, Output
-from lerobot_unimask.language.masks import ASKABLE
+from lerobot_unimask.language.masks import ASKABLE, Mask
 
 Predictions = dict[str, list[Tensor]]  # factor -> one (B, K, size) for each of its outputs
 
@@ -214,6 +214,9 @@ class Cache:
     and of causal attention, for the first n tokens, their inputs, (B, n, W), and each block's keys and values, (B, H,
     n, W/H)."""
 
+    question: Mask | None = None  # the last one that was answered causally
+    slides: bool = False  # whether each step begins anew
+    grows: bool = False  # whether more than one token is asked at a step
     embedded: dict[str, tuple[Tensor, Tensor, Tensor]] = field(default_factory=dict)
     inputs: Tensor | None = None
     keys: list[Tensor] = field(default_factory=list)
@@ -221,11 +224,15 @@ class Cache:
 
     def slide(self) -> None:
         """Forget what depends on where in the window a token stands: all that comes after its embedding."""
+        self.slides = True
         self.inputs, self.keys, self.values = None, [], []
 
     def embed(self, name: str, embedding: nn.Module, value: Tensor, shown: Tensor) -> Tensor:
         """A factor's tokens, (B, K, W). Once the window stands a step later than before, three of them are new: the
-        first, whose displacement is lost, and the last two. The others depend on themselves and the step before."""
+        first, whose displacement is lost, and the last two. The others depend on themselves and the step before. A few
+        windows are embedded sooner than compared."""
+        if not self.slides or len(value) < 8:
+            return embedding(value, shown)
         tokens = self._kept(name, value, shown)
         if tokens is None:
             tokens = embedding(value, shown)
@@ -299,6 +306,25 @@ class Block(nn.Module):
             x, attended = x.flatten(0, 1)[read], attended.flatten(0, 1)[read]
         x = x + self.dropout(self.project(attended))
         return x + self.feedforward(self.norm_feedforward(x)), (key, value)
+
+    def last(self, x: Tensor) -> Tensor:
+        """The output of the last of (B, n, W) tokens, which sees all: (B, 1, W), as `forward` computes it, without keys
+        and values of the others: its query goes back through the keys' weights, and what it reads through the values'.
+        """
+        if type(self.query_key_value) is not nn.Linear:  # an adapter, whose weights are not all
+            return self(x, None, None, last=True)[0]
+        H = self.heads
+        with torch.autocast(x.device.type, enabled=False):
+            seen = self.norm_attention(x.float())  # (B, n, W)
+            query, key, value = self.query_key_value.weight.chunk(3)  # each (W, W); a key's bias moves all scores alike
+            bias = self.query_key_value.bias
+            asked = functional.linear(seen[:, -1], query, bias[: len(query)]).unflatten(1, (H, -1)).transpose(0, 1)
+            toward = (asked / math.sqrt(asked.shape[-1])) @ key.unflatten(0, (H, -1))  # (H, B, W)
+            weights = (toward.transpose(0, 1) @ seen.transpose(1, 2)).softmax(-1)  # (B, H, n)
+            read = (weights @ seen).transpose(0, 1) @ value.unflatten(0, (H, -1)).transpose(1, 2)  # (H, B, W/H)
+            attended = read.transpose(0, 1).flatten(1) + bias[-len(value) :]
+        x = x[:, -1:] + self.project(attended).unsqueeze(1)
+        return x + self.feedforward(self.norm_feedforward(x))
 
     def _attend(self, query: Tensor, key: Tensor, value: Tensor, attend: Tensor | None) -> Tensor:
         """(B, H, n, W/H). On a processor PyTorch's own is not fused once it has a dropout, which it draws slowly, and a

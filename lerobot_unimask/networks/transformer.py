@@ -115,11 +115,12 @@ class Transformer(nn.Module):
         x = self._stack(tokens) if self.stacked else self._lay_out(tokens)  # (B, N, W)
         x = self.dropout(x + self.positions)
         static = x.device.type != "cpu" or torch.compiler.is_compiling()  # how much is computed never depends on masks
-        if asked is not None and cache is None and not self.stacked and not static:
+        if cache is not None:
+            predictions = self._predict_next(x, shown, cache)
+        elif asked is not None and not self.stacked and not static:
             predictions = self._predict_asked(x, causal, asked)
         else:
-            x = self._attend(x, causal) if cache is None else self._extend(x, self._count(shown), cache)
-            x = self.norm(x)
+            x = self.norm(self._attend(x, causal))
             if causal is not False:  # the token before; nothing stands before the first one
                 before = functional.pad(x, (0, 0, 1, -1))
                 x = before if causal is True else torch.where(causal[:, None, None], before, x)
@@ -161,19 +162,32 @@ class Transformer(nn.Module):
             x, _ = block(x, attend, None)
         return self.blocks[-1](x, attend, None, read=read)[0]
 
-    def _extend(self, x: Tensor, count: int, cache: Cache) -> Tensor:
-        """The last of the first `count` tokens of (B, N, W), from those alone that the cache lacks; elsewhere 0."""
-        if cache.inputs is None or not cache.matches(x[:, :count]) or cache.inputs.shape[1] == count:
+    def _predict_next(self, x: Tensor, shown: dict[str, Tensor], cache: Cache) -> Predictions:
+        """The token after the last one of (B, N, W) that is shown in some window; of others nothing that counts."""
+        count = self._count(shown)
+        last = self.norm(self._extend(x[:, :count], cache))  # (B, 1, W)
+        return self.heads(self._split(functional.pad(last, (0, 0, count, x.shape[1] - count - 1)), ASKABLE))
+
+    def _extend(self, x: Tensor, cache: Cache) -> Tensor:
+        """The last of (B, n, W) tokens, (B, 1, W), from those alone that the cache lacks."""
+        if cache.slides and not cache.grows:  # nobody will read what could be kept
+            attend = _before_or_here(x.shape[1], x.device)
+            for block in self.blocks[:-1]:
+                x, _ = block(x, attend, None)
+            last = self.blocks[-1]
+            assert isinstance(last, Block)
+            return last.last(x)
+        if cache.inputs is None or not cache.matches(x) or cache.inputs.shape[1] == x.shape[1]:
             cache.inputs, cache.keys, cache.values = None, [], []
         start = 0 if cache.inputs is None else cache.inputs.shape[1]
-        attend = _before_or_here(count, x.device)[start:]
-        new = x[:, start:count]
+        attend = _before_or_here(x.shape[1], x.device)[start:]
+        new = x[:, start:]
         for depth, block in enumerate(self.blocks):
             past = (cache.keys[depth], cache.values[depth]) if start else None
             new, kept = block(new, attend, past, last=depth == len(self.blocks) - 1)
             cache.keys[depth : depth + 1], cache.values[depth : depth + 1] = [kept[0]], [kept[1]]
-        cache.inputs = x[:, :count]
-        return functional.pad(new, (0, 0, count - 1, x.shape[1] - count))
+        cache.inputs = x
+        return new
 
     def _count(self, shown: dict[str, Tensor]) -> int:
         """Tokens up to the last state, picture or action that is shown in some window."""

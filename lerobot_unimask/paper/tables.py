@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from lerobot_unimask.bench import tables as bench_tables
 from lerobot_unimask.language.masks import TASKS
 from lerobot_unimask.paper import claims, study_tables
 from lerobot_unimask.records import markdown_table, read_json
@@ -303,4 +304,5 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"DoorKey: the paper's claim": claims.doorkey_claims,
     r"Maze2D: the paper's claim": claims.maze2d_claims,
     r"record \| runs": _hours,
+    r"processor ms": bench_tables.beside,
 }
