@@ -196,9 +196,8 @@ class UniMASKConfig(PreTrainedConfig):
     use_amp: bool = False
     """Whether training computes in bfloat16; on a processor that has no such arithmetic it stays with float32."""
     compile_model: bool | None = None
-    """Whether torch.compile captures what an update computes up to its loss, and the way back: some 20 to 60 s at the
-    start, and on a GPU a few launches for each update instead of hundreds. None: on a GPU, after the first 200 updates,
-    in a process that trains by itself a model without cameras; where capturing fails, updates stay as they are."""
+    """Whether torch.compile captures what an update computes: 20 to 60 s at the start, and on a GPU a few launches for
+    each update instead of hundreds. None: on one GPU, without cameras, after 200 updates; not where it fails."""
     scheduler_warmup_steps: int = 200
     """Updates in which the learning rate rises; then it falls along a cosine."""
 

@@ -23,7 +23,6 @@ Work = Callable[[str], None]
 
 def unimask() -> Work:
     """This package's policy with its defaults."""
-    import lerobot_policy_unimask  # noqa: F401 (registers the policy)
     from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 
     def make(masks: str) -> UniMASKPolicy:
