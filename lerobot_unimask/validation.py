@@ -190,7 +190,8 @@ def summary(record: dict[str, Any]) -> str:
             best = optimum.get(name, [{}] * len(asked))
             for said, exact in zip(asked, best, strict=True):
                 parts = [
-                    f"{what.replace('_', ' ')} {said[what]:.4f}" + f" (optimum {exact[what]:.4f})" * (what in exact)
+                    f"{what.replace('_', ' ')} {said[what]:.4f}"
+                    + (f" (optimum {exact[what]:.4f})" if what in exact else "")
                     for what in ("mean_absolute_error", "error", "log_loss", "calibration_error")
                     if what in said
                 ]

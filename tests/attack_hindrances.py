@@ -227,7 +227,6 @@ def full_caches(count: int, _: Path) -> Iterator[tuple[str, Outcome]]:
 SESSION = """
 import sys
 from lerobot.scripts import lerobot_train
-from policies import TRAIN_FLAGS
 from lerobot_unimask import cli
 import lerobot_policy_unimask
 words, commands = [], sys.argv[1:]

@@ -18,6 +18,7 @@ from policies import SMALL_FLAGS
 from dataset_builders.prepare import make_plan, prepare
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy, cli, query
 from lerobot_unimask.data.episodes import open_dataset, read_window
+from lerobot_unimask.data.factors import flat_names
 from lerobot_unimask.records import read_json
 
 JOINTS = ["shoulder", "elbow"]
@@ -290,3 +291,19 @@ def test_it_replaces_where_it_is_told_to(renamed, tmp_path):
     cli.main(["prepare", f"--dataset.root={copy}", "--replace=true"])
     assert make_plan(copy).rename == {}
     assert list(tmp_path.iterdir()) == [copy]
+
+
+@pytest.mark.parametrize(
+    ("names", "flat"),
+    [
+        ({"motors": ["a", "b"]}, ["a", "b"]),
+        ({"motors": {"a": 0, "b": 1}}, ["a", "b"]),
+        ({"left": ["j0", "j1"], "right": ["j0", "j1"]}, ["left.j0", "left.j1", "right.j0", "right.j1"]),
+        ({"left": ["left_j0"], "right": ["right_j0"]}, ["left_j0", "right_j0"]),
+        ([["a", "b"], ["c"]], ["a", "b", "c"]),
+        ({"a": 0, "b": 1}, ["a", "b"]),
+        (None, []),
+    ],
+)
+def test_nested_names_are_read_as_they_are_meant(names, flat):
+    assert flat_names(names) == flat

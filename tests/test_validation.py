@@ -18,7 +18,7 @@ from lerobot_unimask.data.checkpoints import checkpoints_of, episodes_trained_on
 from lerobot_unimask.data.episodes import first_windows, open_dataset
 from lerobot_unimask.language.masks import RANDOM_MASK
 from lerobot_unimask.language.training_masks import VALIDATION_STEP, TrainingMasks
-from lerobot_unimask.validation import task_losses, validate
+from lerobot_unimask.validation import summary, task_losses, validate
 
 ALL = (*TASKS, RANDOM_MASK)
 EPISODES = 30  # of the dataset in conftest
@@ -254,3 +254,11 @@ def test_a_model_without_returns_is_validated_on_the_tasks_that_it_has(tiny_poli
     (result,) = validate([tmp_path], doorkey_root)["runs"]
     assert result["losses"].keys() == set(ALL) - {"reward_conditioned"}
     assert result["training"] is None  # nothing but the weights and their config is there
+
+
+def test_what_is_foretold_is_summed_up_without_an_optimum_too():
+    foretold = {"task": [{"t": 3, "error": 0.25, "log_loss": 0.5}]}
+    record = {"mean": {"past": 1.0}, "spread": {"past": 0.0}, "runs": [{"foretold": foretold}]}
+    said = summary(record)
+    assert "t=3: error 0.2500, log loss 0.5000" in said
+    assert "optimum" not in said

@@ -235,9 +235,14 @@ def names_of(feature: Feature) -> tuple[str, ...]:
 
 
 def flat_names(names: Any) -> list[str]:
-    """Names as `info.json` has them, some nested one deep: `[["a", "b"]]`, `{"motors": ["a", "b"]}`."""
+    """Names as `info.json` has them, some nested one deep: `[["a", "b"]]`, `{"motors": ["a", "b"]}`, `{"motors": {"a":
+    0, "b": 1}}`; those that two groups share begin with the group's."""
     if isinstance(names, Mapping):
-        names = list(names.values()) if any(isinstance(part, list) for part in names.values()) else list(names)
+        parts = [(group, list(part)) for group, part in names.items() if isinstance(part, list | tuple | Mapping)]
+        found = [name for _, part in parts for name in part]
+        if len(set(found)) < len(found):  # two arms, each with its joints
+            found = [f"{group}.{name}" for group, part in parts for name in part]
+        names = found or list(names)
     flat: list[Any] = []
     for part in names if isinstance(names, list | tuple) else []:
         flat += part if isinstance(part, list | tuple) else [part]
