@@ -40,6 +40,7 @@ def test_answers_are_distributions_shown_values_come_back_and_hidden_ones_are_na
 
 
 def test_a_token_asked_alone_or_among_others_has_the_same_marginal(kind, layout, tiny_policy, batch_of):
+    """To float rounding: some processors multiply few rows by another kernel than many."""
     policy, batch = tiny_policy(kind, **LAYOUTS[layout]), batch_of(kind)
     together = policy.infer(batch, "s[1:], a[:] | s[0]")
     for step in range(10):
@@ -48,7 +49,7 @@ def test_a_token_asked_alone_or_among_others_has_the_same_marginal(kind, layout,
             for field in PARTS:
                 if getattr(one, field, None) is not None:
                     value, other = getattr(one, field)[:, step], getattr(among, field)[:, step]
-                    assert torch.equal(value.nan_to_num(-99), other.nan_to_num(-99))
+                    torch.testing.assert_close(value, other, equal_nan=True)
 
 
 @pytest.mark.parametrize("task", TASKS)
