@@ -78,8 +78,8 @@ def error_ahead(policy: UniMASKPolicy, batch: dict[str, Tensor], ahead: int) -> 
 
 @torch.no_grad()
 def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str) -> float:
-    """The mean squared error of the predicted action, in standard deviations of the data, over all windows, steps t and
-    dimensions: what a rollout's returns follow, and far less noisy than they are."""
+    """The mean squared error of the action that acting would carry out, in standard deviations of the data, over all
+    windows, steps t and dimensions: what a rollout's returns follow, and far less noisy than they are."""
     policy.eval()
     recorded = policy.make_window(batch)
     actions = recorded.values["a"]  # (B, K, D)
@@ -88,7 +88,7 @@ def action_error(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
     for t in table.t.tolist():
         mask = table.at(t, len(actions)).to(policy.device).within(recorded.valid)
         answer = answer_question(policy, recorded, mask)
-        error = (answer.most_likely("a")[:, t] - actions[:, t]) / policy.statistics.get_buffer("a_std")
+        error = (answer.carried_out("a")[:, t] - actions[:, t]) / policy.statistics.get_buffer("a_std")
         errors.append(error[mask.asked["a"][:, t]].square().flatten())
     return torch.cat(errors).mean().item()
 

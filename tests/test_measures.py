@@ -74,12 +74,13 @@ def test_the_error_ahead_is_the_distance_to_the_true_state(make, root):
         error_ahead(policy, batch, 7)
 
 
-def test_the_action_error_is_that_of_the_answers_to_each_step(make, root):
-    policy = make()
+@pytest.mark.parametrize("head", ["gaussian", "mixture"])
+def test_the_action_error_is_that_of_what_acting_does_at_each_step(make, root, head):
+    policy = make(continuous_head=head)
     batch = windows(policy, root)
     actions = policy.make_window(batch).values["a"]
     steps = range(policy.config.context_length)
-    answers = [policy.infer(batch, "behavior_cloning", t=t).most_likely("a")[:, t] for t in steps]
+    answers = [policy.infer(batch, "behavior_cloning", t=t).carried_out("a")[:, t] for t in steps]
     error = (torch.stack(answers, dim=1) - actions) / policy.statistics.a_std
     assert action_error(policy, batch, "behavior_cloning") == pytest.approx(error.square().mean().item(), rel=1e-5)
 

@@ -34,7 +34,7 @@ class HeldOutActions:
         mask = validation_masks(text, factors, window.valid, index, tuple(model.cameras))
         asked = mask.asked["a"][:, 1:]
         with contextlib.suppress(MaskError):  # the model has not learnt to answer what acting asks
-            guessed = answer(model, window, mask).most_likely("a")[:, 1:][asked]  # (n, D)
+            guessed = answer(model, window, mask).carried_out("a")[:, 1:][asked]  # (n, D)
             recorded, last = window.values["a"][:, 1:][asked], window.values["a"][:, :-1][asked]
             self.missed += torch.stack([_missed(model, guess, recorded) for guess in (guessed, last)]).cpu()
             self.steps += len(recorded)
