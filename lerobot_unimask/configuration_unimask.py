@@ -103,8 +103,8 @@ class UniMASKConfig(PreTrainedConfig):
     """
 
     # The window
-    context_length: int = 10
-    """K: steps that the model sees at once."""
+    context_length: int = 5
+    """K: steps that the model sees at once; a question about more of them needs a longer window."""
     drop_n_last_frames: int | None = None
     """Frames at the end of an episode that start no training window; None: K - 1, which keeps to full windows."""
 
@@ -238,9 +238,10 @@ class UniMASKConfig(PreTrainedConfig):
         for name, most in MOST.items():
             value, bound = getattr(self, name), getattr(self, most) if isinstance(most, str) else most
             if value is not None and not 1 <= value <= bound:
-                raise ValueError(
-                    f"{name} is {value}; it must lie in 1 to {bound}{f', {most}' if bound != most else ''}."
-                )
+                limit = f", {most}" if bound != most else ""
+                if most == "context_length" and value > bound:
+                    limit += f". For more train with --policy.context_length={value} or more"
+                raise ValueError(f"{name} is {value}; it must lie in 1 to {bound}{limit}.")
         if self.drop_n_last_frames is None:
             self.drop_n_last_frames = self.context_length - 1
         if self.network not in NETWORKS:
@@ -274,9 +275,7 @@ class UniMASKConfig(PreTrainedConfig):
         if self.width % self.heads:
             raise ValueError(f"width ({self.width}) must be a multiple of heads ({self.heads}).")
         if len(self.image_size) != 2 or not all(1 <= size <= 4096 for size in self.image_size):
-            raise ValueError(
-                f"image_size is {self.image_size}; give height and width, 1 to 4096 pixels each: [96, 96]."
-            )
+            raise ValueError(f"image_size is {self.image_size}; give height and width, 1 to 4096 pixels: [96, 96].")
         if self.vision_backbone is not None and not self.vision_backbone.startswith("resnet"):
             raise ValueError(f"vision_backbone is {self.vision_backbone!r}; name a ResNet, such as resnet18, or none.")
         if self.pretrained_backbone_weights is not None and self.vision_backbone is None:

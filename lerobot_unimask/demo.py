@@ -133,6 +133,7 @@ def _train(output: Path, data: Path, steps: int, threads: int) -> Path:
         "--policy.type=unimask",
         "--policy.push_to_hub=false",
         f"--policy.training_masks={json.dumps(MASKS)}",
+        "--policy.context_length=10",  # a whole episode
         "--policy.attention=bidirectional",  # the paper's network: half as many tokens, so twice the updates in time
         "--policy.token_layout=stacked",
         "--policy.depth=2",

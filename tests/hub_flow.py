@@ -55,6 +55,7 @@ from lerobot_unimask.sharing.hub import HubError  # noqa: E402
 torch.set_num_threads(1)
 
 SMALL = ["--policy.width=16", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
+SMALL += ["--policy.context_length=10"]
 TRAIN = ["--batch_size=8", "--num_workers=0", "--policy.device=cpu"]
 FILES = {  # of a pushed policy
     ".gitattributes",

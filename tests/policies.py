@@ -21,7 +21,7 @@ CONTINUOUS_STATS = {
     "timestamp": {"max": [4.9]},
 }
 
-SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16}
+SMALL = {"context_length": 10, "width": 16, "depth": 1, "heads": 2, "feedforward_width": 16}
 SMALL_FLAGS = [f"--policy.{name}={value}" for name, value in SMALL.items()]
 TRAIN_FLAGS = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", *SMALL_FLAGS]
 
@@ -67,7 +67,7 @@ def doorkey_policy(features=None, **settings):
     from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 
     torch.manual_seed(0)
-    config = UniMASKConfig(device="cpu", **SMALL, **settings)
+    config = UniMASKConfig(device="cpu", **(SMALL | settings))
     config.set_dataset_feature_metadata(features or FEATURES)
     return UniMASKPolicy(config)
 

@@ -22,7 +22,7 @@ STEPS = 200  # of an episode
 BATCH = 100
 UPDATES = 200
 POLICY = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", "--policy.width=16"]
-POLICY += ["--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
+POLICY += ["--policy.context_length=10", "--policy.depth=1", "--policy.heads=2", "--policy.feedforward_width=16"]
 
 
 def build(root: Path, frames: int) -> None:

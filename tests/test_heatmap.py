@@ -27,6 +27,7 @@ from lerobot_unimask.validation import task_losses
 CONFIGS = Path(__file__).parents[1] / "configs"
 SMALL = {
     "device": "cpu",
+    "context_length": 10,
     "attention": "bidirectional",
     "token_layout": "stacked",
     "width": 16,

@@ -2,17 +2,16 @@
 
 import pytest
 import torch
-from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, Episode
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, SMALL, Episode
 
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.data.factors import Feature
 
 TASKS = ["open the door", "close it"]
-SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "dropout": 0.0, "device": "cpu"}
 
 
 def make(tasks=TASKS, **settings):
-    config = UniMASKConfig(**(SMALL | settings))
+    config = UniMASKConfig(device="cpu", **(SMALL | {"dropout": 0.0} | settings))
     config.set_dataset_feature_metadata(CONTINUOUS_FEATURES)
     config.add_tasks(tasks)
     torch.manual_seed(0)

@@ -54,6 +54,7 @@ def train(root: Path, run: str, steps: int, batch: int) -> dict[str, Any]:
     """One training in a forked process: its seconds, and of its updates and their waiting for data the medians."""
     began, before = time.perf_counter(), os.times()
     flags = ["--policy.type=unimask", "--policy.push_to_hub=false", "--policy.device=cpu", "--num_workers=0"]
+    flags += ["--policy.context_length=10"]
     data = ["--dataset.repo_id=local/arm", f"--dataset.root={root}", f"--steps={steps}", f"--batch_size={batch}"]
     log = commands.check(
         "lerobot-train",

@@ -22,11 +22,12 @@ Work = Callable[[str], None]
 
 
 def unimask() -> Work:
-    """This package's policy with its defaults."""
+    """This package's policy with its defaults, but for the window's length."""
     from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 
     def make(masks: str) -> UniMASKPolicy:
-        config = UniMASKConfig(device="cpu", training_masks=masks, width=WIDTH, heads=HEADS, feedforward_width=INNER)
+        sizes: dict[str, Any] = {"context_length": CONTEXT, "width": WIDTH, "heads": HEADS, "feedforward_width": INNER}
+        config = UniMASKConfig(device="cpu", training_masks=masks, **sizes)
         config.set_dataset_feature_metadata(
             {
                 "observation.state": {"dtype": "float32", "shape": (STATE,), "names": None},

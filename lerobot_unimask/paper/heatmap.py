@@ -171,9 +171,9 @@ def execute(config: HeatmapConfig, run: Run) -> dict[str, Any]:
 
 def optimum_losses(config: HeatmapConfig) -> dict[str, float]:
     """The loss that no model can beat in expectation, on the validation windows and masks."""
-    K = config.policy.get("context_length", 10)
-    root = _validation_root(config)
-    batch = first_windows(open_dataset(UniMASKConfig(context_length=K), root))
+    policy = UniMASKConfig(**config.policy)
+    K = policy.context_length
+    batch = first_windows(open_dataset(policy, _validation_root(config)))
     window = make_window(batch, FEATURES, K, horizon=torch.tensor(float(HORIZON)), fps=torch.tensor(float(FPS)))
     optimum = Optimum(config.expert)
     losses = {}
