@@ -1,11 +1,13 @@
-"""The default policy on tasks of MetaWorld's arm, one for each task or one for all, beside a perceptron.
+"""The default policy on tasks of MetaWorld's arm, one for each task or one for all, beside a perceptron; windows and
+memories of several lengths.
 
     OMP_NUM_THREADS=1 uv run python tests/arm_tasks.py --roots=data/peg,data/hammer --seeds=0,1 \
         --output=docs/results/FILE.json
 
 Trained as lerobot-train does, then rolled out from unseen starts, the same for every model and seed. Each run stands in
 the record as soon as it is done, and what stands there is not run again. A setting can be changed:
-`--settings='{"context_length": 3}'`. A dataset of several tasks makes one policy that is told the task.
+`--settings='{"width": 256}'`. A dataset of several tasks makes one policy that is told the task. `--windows=2,5,10,20
+--remember=1,2,3,5,10` trains a policy for each length of window and rolls it out with each memory that is shorter.
 """
 
 import argparse
@@ -19,6 +21,7 @@ import torch
 from arm import success
 
 import lerobot_policy_unimask  # noqa: F401 (registers)
+from lerobot_unimask import UniMASKConfig
 from lerobot_unimask.data.episodes import provenance_of, read_info
 from lerobot_unimask.envs.metaworld.environment import OBJECT, MetaWorldEnv
 from lerobot_unimask.machine import describe_machine
@@ -27,10 +30,13 @@ from lerobot_unimask.training import Trainer
 
 KEPT = ("context_length", "n_obs_steps", "training_masks", "causal_share", "fine_inputs", "continuous_head", "dropout")
 
+DEFAULT = UniMASKConfig().context_length
 
-def policy_runs(root: Path, seed: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+
+def policy_runs(root: Path, seed: int, K: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """One policy trained on a dataset, and its success on each of the dataset's tasks."""
     settings = {"mask_seed": seed, **arguments.settings}
+    settings |= {} if K == DEFAULT else {"context_length": K}
     trainer = Trainer(settings, root, seed=seed, steps=arguments.updates, batch_size=arguments.batch_size)
     began = time.process_time()
     for _ in trainer:
@@ -38,7 +44,8 @@ def policy_runs(root: Path, seed: int, arguments: argparse.Namespace) -> list[di
     spent = time.process_time() - began
     policy = trainer.policy.eval()
     if arguments.save is not None:
-        policy.save_pretrained(arguments.save / f"{root.name}_{seed}")
+        name = f"{root.name}_{seed}{'' if K == DEFAULT else f'_k{K}'}"
+        policy.save_pretrained(arguments.save / name)
     facts = {"updates": arguments.updates, "train_processor_seconds": round(spent, 1), **trainer.record()}
     facts |= {"policy": {name: getattr(policy.config, name) for name in KEPT}}
     tasks, found = provenance_of(root)["task"].split(","), []
@@ -46,6 +53,11 @@ def policy_runs(root: Path, seed: int, arguments: argparse.Namespace) -> list[di
     for task in tasks:
         envs = [MetaWorldEnv(task, objects, render_mode=None) for _ in range(arguments.episodes)]
         found.append({"task": task, **facts, **success(policy, envs, arguments.starts)})
+        for h in arguments.remember:
+            if h < K:
+                policy.config.n_obs_steps = h
+                found[-1].setdefault("remembers", {})[str(h)] = success(policy, envs, arguments.starts)
+        policy.config.n_obs_steps = None
     return found
 
 
@@ -56,17 +68,30 @@ def perceptron_runs(root: Path, seed: int, updates: int, arguments: argparse.Nam
     return [{"task": task, "updates": updates, **facts}]
 
 
+def numbers(text: str) -> list[int]:
+    """Comma-separated numbers."""
+    return [int(number) for number in text.split(",") if number]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--roots", required=True, help="datasets of `unimask build metaworld`, comma-separated")
-    parser.add_argument("--seeds", default="0,1", help="of weights, batches and masks; default: %(default)s")
+    parser.add_argument(
+        "--seeds", type=numbers, default="0,1", help="of weights, batches and masks; default: %(default)s"
+    )
     parser.add_argument("--settings", type=json.loads, default={}, help="of the policy; default: none changed")
-    parser.add_argument("--updates", type=int, default=2000, help="of the policy; default: %(default)s")
+    parser.add_argument("--windows", type=numbers, default=[DEFAULT], help="K, a policy for each")
+    parser.add_argument("--remember", type=numbers, default=[], help="steps, fewer than K, that acting also remembers")
+    parser.add_argument("--updates", type=int, default=1500, help="of the policy; default: %(default)s")
     parser.add_argument("--batch_size", type=int, default=64)
-    parser.add_argument("--perceptron", default="5000,20000", help="its updates, a run for each; default: %(default)s")
+    parser.add_argument(
+        "--perceptron", type=numbers, default="5000,20000", help="its updates, a run for each; default: %(default)s"
+    )
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--starts", type=int, default=100_000, help="seed of the first start; default: %(default)s")
-    parser.add_argument("--save", type=Path, help="folder for the policies, NAME_SEED; default: none is kept")
+    parser.add_argument(
+        "--save", type=Path, help="folder for the policies, NAME_SEED or NAME_SEED_kK; default: none is kept"
+    )
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -78,22 +103,20 @@ def main() -> None:
         "runs": read_json(arguments.output)["runs"] if arguments.output.exists() else [],
     }
     wanted = [
-        (model, Path(root), int(seed), int(updates))
-        for seed in arguments.seeds.split(",")
+        (model, Path(root), seed, K, updates)
+        for seed in arguments.seeds
         for root in arguments.roots.split(",")
-        for model, updates in [
-            ("unimask", arguments.updates),
-            *(("perceptron", updates) for updates in filter(None, arguments.perceptron.split(","))),
+        for model, K, updates in [
+            *(("unimask", K, arguments.updates) for K in arguments.windows),
+            *(("perceptron", None, updates) for updates in arguments.perceptron),
         ]
     ]
-    for model, root, seed, updates in wanted:
+    for model, root, seed, K, updates in wanted:
         names = {"model": model, "data": root.name, "seed": seed}
+        names |= {"context_length": K} if K else {}
         if any(run["updates"] == updates and names.items() <= run.items() for run in record["runs"]):
             continue
-        if model == "unimask":
-            found = policy_runs(root, seed, arguments)
-        else:
-            found = perceptron_runs(root, seed, updates, arguments)
+        found = policy_runs(root, seed, K, arguments) if K else perceptron_runs(root, seed, updates, arguments)
         record["runs"] += [{**names, **run} for run in found]
         write_json(arguments.output, record)
         for run in found:

@@ -187,47 +187,30 @@ def test_doorkey_does_what_it_is_asked():
     assert asked["consistency"]["shown_values_changed"] == 0
 
 
-@pytest.mark.parametrize("task", ["peg", "pick", "door", "drawer"])
-def test_the_default_acts_on_the_arm_as_the_page_says(task):
-    found, perceptron = record(f"arm_{task}_policy.json"), record(f"arm_{task}_perceptron.json")
-    acts, seconds = found["remembers"]["10"]["success"], found["train_processor_seconds"]
-    assert found["training"]["settings"] == {"mask_seed": 0}
-    assert acts >= 0.95 - 1e-6
-    assert acts > max(run["success"] for run in perceptron["updates"].values()) - 0.05
-    assert (
-        f"{100 * acts:.0f} ({100 * found['remembers']['10']['standard_error']:.0f}), {seconds:.0f} s" in PAGES["arm.md"]
-    )
+def mean_success(runs):
+    return statistics.mean(run["success"] for run in runs)
 
 
-def test_five_steps_act_on_the_arm_as_the_page_says():
-    found = record("arm_k5.json")["runs"]
-    runs = [run for run in found if run["model"] == "unimask"]
-    slowest = max(run["train_processor_seconds"] for run in found if run["model"] == "perceptron")
-    for run in runs:
-        assert run["settings"] == {"mask_seed": run["seed"], "context_length": 5}
-        assert run["success"] >= 0.95 - 1e-6
-        assert run["train_processor_seconds"] < 10 * slowest
-        cell = f"{100 * run['success']:.0f} ({100 * run['standard_error']:.0f}) | {run['episodes']}"
-        seconds = f"{run['train_processor_seconds']:.0f} s"
-        assert f"| {run['task']} | {run['seed']} | {cell} | {seconds} |" in PAGES["arm.md"]
+def arm_runs(name, **wanted):
+    return [run for run in record(name)["runs"] if wanted.items() <= run.items()]
 
 
-def test_one_model_acts_on_six_tasks_as_the_page_says():
-    runs = record("arm_six.json")["runs"]
-    mean = sum(run["success"] for run in runs) / len(runs)
-    error = (sum(run["standard_error"] ** 2 for run in runs)) ** 0.5 / len(runs)
-    cells = [(run["success"], run["standard_error"]) for run in runs] + [(mean, error)]
-    tasks = " | ".join(run["task"] for run in runs)
-    row = " | ".join(f"{100 * share:.0f} ({100 * spread:.0f})" for share, spread in cells)
-    assert f"| {tasks} | mean |" in PAGES["arm.md"]
-    assert f"| {row} |" in PAGES["arm.md"]
+ARM = list(dict.fromkeys(run["task"] for run in record("arm_k5.json")["runs"]))
 
 
-def test_act_is_beside_it_as_the_page_says():
-    (act,) = record("arm_others.json")["runs"]
-    ours = record("arm_k5.json")["runs"][0]
-    assert act["train_processor_seconds"] == pytest.approx(ours["train_processor_seconds"], abs=0.5)
-    for run in (ours, act):
-        success = f"{100 * run['success']:.0f} ({100 * run['standard_error']:.0f})"
-        cells = f"{run['updates']:,} | {run['parameters']:,} | {success} | {run['acting_ms_per_episode_step']:.2f}"
-        assert f"| {cells} |" in PAGES["arm.md"]
+def test_the_default_succeeds_on_the_arm():
+    ours = arm_runs("arm_k5.json", model="unimask", episodes=100)
+    assert sorted((run["task"], run["seed"]) for run in ours) == sorted((task, seed) for task in ARM for seed in (0, 1))
+    assert len(ARM) == 6
+    assert mean_success(ours) >= 0.95
+    assert all(run["settings"] == {"mask_seed": run["seed"], "context_length": 5} for run in ours)
+
+
+@pytest.mark.parametrize("task", ARM)
+def test_the_default_is_beside_a_perceptron_at_its_best(task):
+    ours = arm_runs("arm_k5.json", model="unimask", task=task)
+    perceptrons = [arm_runs("arm_k5.json", model="perceptron", task=task, updates=n) for n in (5000, 20000)]
+    best = max(perceptrons, key=mean_success)
+    assert mean_success(ours) > mean_success(best) - 0.05
+    seconds = [statistics.mean(run["train_processor_seconds"] for run in runs) for runs in (ours, best)]
+    assert seconds[0] < 10 * seconds[1]

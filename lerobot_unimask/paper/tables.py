@@ -8,7 +8,7 @@ A page names records above a table, one in a line, and the table's head says wha
 
 import re
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -255,18 +255,77 @@ def _attacks(record: Record) -> str:
 # --- The arm, and how much acting remembers ---------------------------------------------------------------------------
 
 
-def _remembered_success(*records: Record) -> str:
-    ways = {"remembers": "slides", "forgets": "forgets"}
-    steps = sorted({int(h) for record in records for way in ways for h in record[way]})
+def _percent(runs: Sequence[Record]) -> str:
+    """Mean success, and its standard error over all episodes."""
+    share = statistics.mean(run["success"] for run in runs)
+    error = sum(run["standard_error"] ** 2 for run in runs) ** 0.5 / len(runs)
+    return f"{100 * share:.0f} ({100 * error:.0f})"
 
-    def text(found: Mapping[str, float] | None) -> str | None:
-        return f"{100 * found['success']:.0f} ({100 * found['standard_error']:.0f})" if found else None
 
+def _beside_a_perceptron(record: Record) -> str:
+    """Success in % and processor seconds of training, a row for each task. The last column is how many times the time
+    of the perceptron that succeeds most, the shorter one of two that are alike."""
+    tasks = list(dict.fromkeys(run["task"] for run in record["runs"]))
+    models = sorted({(run["model"] != "unimask", run["updates"]) for run in record["runs"]})
+
+    def runs(model: tuple[bool, int], task: str) -> list[Record]:
+        return [r for r in record["runs"] if (r["model"] != "unimask", r["updates"]) == model and r["task"] == task]
+
+    def seconds(model: tuple[bool, int], task: str) -> float:
+        return statistics.mean(run["train_processor_seconds"] for run in runs(model, task))
+
+    def best(task: str) -> tuple[bool, int]:
+        return max(models[1:], key=lambda model: (sum(run["success"] for run in runs(model, task)), -model[1]))
+
+    def row(tasks: Sequence[str]) -> list[str]:
+        spent = {model: statistics.mean(seconds(model, task) for task in tasks) for model in models}
+        found = {model: [run for task in tasks for run in runs(model, task)] for model in models}
+        times = sum(seconds(models[0], task) for task in tasks) / sum(seconds(best(task), task) for task in tasks)
+        return [*(f"{_percent(found[model])}, {spent[model]:.0f} s" for model in models), f"{times:.1f}"]
+
+    heads = [f"{'perceptron' if other else 'the default'}, {updates:,} updates" for other, updates in models]
+    rows = [(task, *row([task])) for task in tasks]
+    return markdown_table(("one model a task", *heads, "times"), [*rows, ("mean", *row(tasks))])
+
+
+def _one_for_all(*records: Record) -> str:
+    """Success in %, a row for each seed of one model a task and of one for all."""
+    kinds: dict[tuple[str, int, int], list[Record]] = {}
+    for record in records:
+        runs = [run for run in record["runs"] if run["model"] == "unimask"]
+        whose = "one each" if len({run["data"] for run in runs}) > 1 else "one for all"
+        for run in runs:
+            kinds.setdefault((whose, run["updates"], run["seed"]), []).append(run)
     rows = (
-        (f"{record['command']['task']}, {name}", *(text(record[way].get(str(h))) for h in steps))
-        for record in records
-        for way, name in ways.items()
+        (f"{whose}, {updates:,} updates, seed {seed}", *(_percent([run]) for run in runs), _percent(runs))
+        for (whose, updates, seed), runs in kinds.items()
     )
+    return markdown_table(("models", *(run["task"] for run in next(iter(kinds.values()))), "mean"), rows)
+
+
+def _trained_as_long(ours: Record, others: Record) -> str:
+    """LeRobot's own policies after so much processor time, each beside the default on its task, seed 0."""
+    rows = []
+    for other in others["runs"]:
+        (beside,) = (r for r in ours["runs"] if (r["model"], r["seed"], r["task"]) == ("unimask", 0, other["task"]))
+        for name, run in (("the default", beside), (other["policy"], other)):
+            spent, acting = run["train_processor_seconds"], run["acting_ms_per_episode_step"]
+            size = f"{run['parameters'] / 1e6:.2f} M"
+            rows.append(
+                (run["task"], name, f"{spent:.0f} s", f"{run['updates']:,}", size, _percent([run]), f"{acting:.2f}")
+            )
+    heads = ("task", "policy", "trained for", "updates", "parameters", "success", "acting, ms a step")
+    return markdown_table(heads, dict.fromkeys(rows))
+
+
+def _remembered_success(record: Record) -> str:
+    """Success in % by the steps that acting remembers, h, a row for each window."""
+    steps = sorted({int(h) for run in record["runs"] for h in [*run.get("remembers", {}), run["context_length"]]})
+    rows = []
+    for run in record["runs"]:
+        found = run.get("remembers", {}) | {str(run["context_length"]): run}
+        name = f"{run['task']}, K = {run['context_length']}"
+        rows.append((name, *(_percent([found[str(h)]]) if str(h) in found else None for h in steps)))
     return markdown_table(("", *(f"h = {h}" for h in steps)), rows)
 
 
@@ -294,6 +353,9 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"frames \| first batch": _scale,
     r"windows a second": _frames,
     r"attack \| tried": _attacks,
+    r"one model a task": _beside_a_perceptron,
+    r"models \|.*\| mean": _one_for_all,
+    r"task \| policy \| trained for": _trained_as_long,
     r"\s*\| h = 1": _remembered_success,
     r"h = 1": _remembered_returns,
     r"H \| carried out": study_tables.acting_table,
