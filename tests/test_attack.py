@@ -1,4 +1,4 @@
-"""A few attempts of each attack. All of them: `python tests/attack.py`, see docs/reliability.md."""
+"""A few attempts of each attack. All of them: `python measuring/attack.py`, see docs/reliability.md."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ATTACK = Path(__file__).with_name("attack.py")
+ATTACK = Path(__file__).parents[1] / "measuring" / "attack.py"
 
 
 @pytest.mark.slow

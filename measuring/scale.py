@@ -1,22 +1,23 @@
 """What ten million frames cost: the memory and time of `lerobot-train`, and windows trained on and read per
 second, beside a dataset a thousand times smaller.
 
-    OMP_NUM_THREADS=1 uv run python tests/scale.py --output=docs/results/scale.json
+    OMP_NUM_THREADS=1 uv run python measuring/scale.py --output=docs/results/scale.json
 
 builds both datasets in a temporary folder (2 GB with the caches; building takes minutes and 4 GB of memory) and
 measures each in a process of its own, with warm caches. `test_scale.py` holds the figures to what is promised.
 """
 
 import argparse
-import importlib.metadata
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from lerobot_unimask.machine import describe_machine
+from lerobot_unimask.records import versions, write_json
 
 STEPS = 200  # of an episode
 BATCH = 100
@@ -103,19 +104,9 @@ def measure(root: Path) -> dict:
     policy_forward, lerobot_unimask.UniMASKPolicy.forward = lerobot_unimask.UniMASKPolicy.forward, forward
     lerobot_train.cycle = keep
     with TemporaryDirectory() as folder:
-        sys.argv = [
-            "lerobot-train",
-            *POLICY,
-            "--dataset.repo_id=local/scale",
-            f"--dataset.root={root}",
-            f"--steps={UPDATES}",
-        ]
-        sys.argv += [
-            f"--batch_size={BATCH}",
-            "--num_workers=0",
-            "--save_checkpoint=false",
-            f"--output_dir={folder}/run",
-        ]
+        data = ["--dataset.repo_id=local/scale", f"--dataset.root={root}", f"--batch_size={BATCH}", "--num_workers=0"]
+        run = [f"--steps={UPDATES}", "--save_checkpoint=false", f"--output_dir={folder}/run"]
+        sys.argv = ["lerobot-train", *POLICY, *data, *run]
         lerobot_train.main()
     note("trained")
 
@@ -159,13 +150,11 @@ def record(frames: int) -> dict:
             run("--measure", root)  # fills datasets' cache
             results[name] = json.loads(run("--measure", root).splitlines()[-1])
     rates = ("windows_trained_per_second", "windows_read_per_second")
-    versions = {name: importlib.metadata.version(name) for name in ("lerobot", "datasets", "pyarrow", "numpy", "torch")}
     return {
         **results,
         "large_over_small": {rate: round(results["large"][rate] / results["small"][rate], 3) for rate in rates},
-        "machine": platform.processor() or platform.machine(),
-        "processors": os.cpu_count(),
-        "versions": versions,
+        "machine": describe_machine(),
+        "versions": versions("datasets", "pyarrow", "numpy"),
     }
 
 
@@ -181,7 +170,7 @@ if __name__ == "__main__":
     elif arguments.measure:
         print(json.dumps(measure(arguments.measure)))
     else:
-        result = {"command": "python tests/scale.py", **record(arguments.frames)}
+        result = {"command": "python measuring/scale.py", **record(arguments.frames)}
         print(json.dumps(result, indent=2))
         if arguments.output:
-            arguments.output.write_text(json.dumps(result, indent=2) + "\n")
+            write_json(arguments.output, result)
