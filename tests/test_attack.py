@@ -1,4 +1,4 @@
-"""A few attempts of each attack. All of them: `python measuring/attack.py`, see docs/reliability.md."""
+"""A few attempts of each attack. All of them: `python tests/measuring/attack.py`, see docs/reliability.md."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ATTACK = Path(__file__).parents[1] / "measuring" / "attack.py"
+ATTACK = Path(__file__).with_name("measuring") / "attack.py"
 
 
 @pytest.mark.slow
@@ -16,7 +16,7 @@ def test_nothing_is_lost(tmp_path) -> None:
     environment = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
     done = subprocess.run(
         [sys.executable, ATTACK, "--share=0.02", f"--output={tmp_path / 'record.json'}"],
-        cwd=ATTACK.parent.parent,
+        cwd=ATTACK.parents[2],
         env={**environment, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

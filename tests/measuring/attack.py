@@ -1,6 +1,6 @@
 """Everything that may go wrong, tried many times: what was refused, what held, and what was lost.
 
-    OMP_NUM_THREADS=1 uv run python measuring/attack.py --output=docs/results/reliability.json
+    OMP_NUM_THREADS=1 uv run python tests/measuring/attack.py --output=docs/results/reliability.json
 
 An attempt is lost if it ends in another error than one clear sentence, takes longer than `SECONDS`, changes an answer
 that it must not change, or leaves something half-made. An attack that the record has already is not made again: who is
@@ -320,7 +320,7 @@ if __name__ == "__main__":
     parser.add_argument("--only", default="", help="attacks whose name holds this text")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    command = f"python measuring/attack.py --share={arguments.share}"
+    command = f"python tests/measuring/attack.py --share={arguments.share}"
 
     def write(record: dict[str, Any]) -> None:
         if arguments.output:

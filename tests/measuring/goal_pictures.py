@@ -1,6 +1,6 @@
 """DoorKey asked by a picture of how things are to stand after nine actions, and the same policy without one.
 
-    python measuring/goal_pictures.py --output=docs/results/doorkey_goal_pictures.json
+    python tests/measuring/goal_pictures.py --output=docs/results/doorkey_goal_pictures.json
 
 Each rollout starts where an episode that was not trained on started; asked for is the picture of its last step. Reached
 is the pictured state: agent and key in the same cells at that step.
@@ -66,7 +66,7 @@ def main(output: Path, folder: Path) -> None:
         "imitation, drawn actions": reached(policy, states, mask=IMITATION, sample=True),
     }
     record = {
-        "command": f"python measuring/goal_pictures.py --output={output}",
+        "command": f"python tests/measuring/goal_pictures.py --output={output}",
         "config": {"settings": SETTINGS, "episodes": EPISODES, "updates": UPDATES, "batch": BATCH, "seed": SEED},
         "rollouts": ROLLOUTS,
         "reached": shares,

@@ -1,7 +1,7 @@
 """What ten million frames cost: the memory and time of `lerobot-train`, and windows trained on and read per
 second, beside a dataset a thousand times smaller.
 
-    OMP_NUM_THREADS=1 uv run python measuring/scale.py --output=docs/results/scale.json
+    OMP_NUM_THREADS=1 uv run python tests/measuring/scale.py --output=docs/results/scale.json
 
 builds both datasets in a temporary folder (2 GB with the caches; building takes minutes and 4 GB of memory) and
 measures each in a process of its own, with warm caches. `test_scale.py` holds the figures to what is promised.
@@ -170,7 +170,7 @@ if __name__ == "__main__":
     elif arguments.measure:
         print(json.dumps(measure(arguments.measure)))
     else:
-        result = {"command": "python measuring/scale.py", **record(arguments.frames)}
+        result = {"command": "python tests/measuring/scale.py", **record(arguments.frames)}
         print(json.dumps(result, indent=2))
         if arguments.output:
             write_json(arguments.output, result)

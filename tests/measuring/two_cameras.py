@@ -1,6 +1,6 @@
 """Memory and waiting of lerobot-train on a recording of two cameras of 640 x 480 at 30 Hz, by LeRobot's own writer.
 
-    OMP_NUM_THREADS=1 uv run python measuring/two_cameras.py --output=docs/results/two_cameras.json
+    OMP_NUM_THREADS=1 uv run python tests/measuring/two_cameras.py --output=docs/results/two_cameras.json
 
 Noise and ramps, the policy's settings at their defaults; twice: the frames are decoded in the first run.
 """
@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 FOLDER = tempfile.TemporaryDirectory()
 os.environ.update(HF_LEROBOT_HOME=FOLDER.name + "/home", HF_HUB_OFFLINE="1")
 
@@ -99,7 +99,7 @@ def main() -> None:
         {
             "what": "lerobot-train on two cameras of 640 x 480 at 30 Hz; the first run decodes their frames",
             "units": "seconds of wall time on a machine shared with other work; bytes",
-            "command": f"python measuring/two_cameras.py {' '.join(sys.argv[1:])}",
+            "command": f"python tests/measuring/two_cameras.py {' '.join(sys.argv[1:])}",
             "settings": {k: v for k, v in vars(arguments).items() if k != "output"},
             "runs": runs,
             "peak_memory_bytes": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024,

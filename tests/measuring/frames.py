@@ -1,6 +1,6 @@
 """Windows with a camera read per second, batched from cached frames and item by item by LeRobot, in one run.
 
-    python measuring/frames.py --output=docs/results/frames.json
+    python tests/measuring/frames.py --output=docs/results/frames.json
 
 One camera of 96 x 96, K = 10, 20 episodes of 150 steps of video, made by LeRobot's own writer from noise and ramps.
 """
