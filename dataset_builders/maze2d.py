@@ -1,7 +1,7 @@
 """Maze2D's expert, a waypoint controller, and the LeRobotDataset of its episodes (UniMASK, section 5.2)."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from dataset_builders.writer import SUCCESS, SUCCESS_FEATURE, write_dataset
 from lerobot_unimask.data.returns import return_to_go
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.envs.maze2d.expert import WaypointExpert, _clip
-from lerobot_unimask.envs.maze2d.maze import ENV_ID, FPS, HORIZON, TASK, parse_maze
+from lerobot_unimask.envs.maze2d.maze import ENV_ID, FPS, HORIZON, parse_maze, task_of
 from lerobot_unimask.envs.maze2d.rendering import camera_picture
 
 FEATURES: dict[str, dict[str, Any]] = {
@@ -28,18 +28,18 @@ FEATURES: dict[str, dict[str, Any]] = {
 
 
 def collect_episodes(
-    maze: str, episodes: int, seed: int, noise: float, progress: bool
+    mazes: Sequence[str], episodes: int, seed: int, noise: float, progress: bool
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Run the expert for whole episodes; N = 200 episodes, frames in order.
+    """Run the expert for whole episodes, one in each maze in turn; N = 200 episodes, frames in order.
 
-    Episode i depends only on (seed, i, maze, noise), and its start and goal not on the noise.
+    Episode i depends only on (seed, i, its maze, noise), and its start and goal not on the noise.
 
     Returns:
         The columns (N, ...) `observation.state`, `action` (as the environment received it), `observation.success`,
         `next.reward` and `next.done`; and each episode's initial velocity, float32 (episodes, 2), which the state
         hides.
     """
-    env = Maze2DEnv(maze)
+    envs = [Maze2DEnv(maze) for maze in mazes]
     frames = episodes * HORIZON
     states = np.empty((frames, 4), np.float32)
     actions = np.empty((frames, 2), np.float32)
@@ -49,6 +49,7 @@ def collect_episodes(
     frame = 0
     bar = tqdm(range(episodes), desc="Rolling out Maze2D", unit="episode", disable=None if progress else True)
     for episode in bar:
+        env = envs[episode % len(envs)]
         start_seed, expert_seed = np.random.SeedSequence([seed, episode]).generate_state(2, np.uint64).tolist()
         observation, _ = env.reset(seed=start_seed)
         initial_velocities[episode] = env.velocity
@@ -91,7 +92,8 @@ def build_maze2d(
     Args:
         root: folder of the dataset: new, or an existing empty one.
         noise: standard deviation of the normal noise added to each action, before it is clipped to [-1, 1].
-        maze: name or text of the maze, see `parse_maze`.
+        maze: name or text of the maze, see `parse_maze`; or several, comma-separated, an episode of each in turn, each
+            a task of its own.
         repo_id: name of the dataset, `ME/NAME`; `local/maze2d` if None.
         camera: whether there is `observation.images.top`, a video of the maze, the goal and the mass from above.
         use_videos: whether it is a video; else pictures in the table.
@@ -110,13 +112,17 @@ def build_maze2d(
         raise ValueError(f"episodes must be at least 1 and seed at least 0, got {episodes} and {seed}.")
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise is a standard deviation, a finite number from 0 up, got {noise}.")
-    columns, initial_velocities = collect_episodes(maze, episodes, seed, noise, progress)
+    mazes = maze.split(",")
+    columns, initial_velocities = collect_episodes(mazes, episodes, seed, noise, progress)
     lengths = np.full(episodes, HORIZON)
     states, features, pictures = columns["observation.state"], dict(FEATURES), {}
     if camera:
-        height, width, _ = camera_picture(parse_maze(maze), (1, 1), (1, 1)).shape
+        shapes = {camera_picture(parse_maze(one), (1, 1), (1, 1)).shape for one in mazes}
+        if len(shapes) > 1:
+            raise ValueError(f"The camera's pictures are of one size, those of the mazes {maze} are not.")
+        height, width, _ = shapes.pop()
         features[CAMERA] = camera_feature(height, width, use_videos=use_videos)
-        pictures[CAMERA] = _pictures(maze, states)
+        pictures[CAMERA] = _pictures(mazes, states)
     if hide_goal:
         features["observation.state"] = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}
         columns["observation.state"] = np.ascontiguousarray(states[:, :2])
@@ -128,7 +134,7 @@ def build_maze2d(
         features=features,
         columns=columns,
         lengths=lengths,
-        task=TASK,
+        task=[task_of(mazes[i % len(mazes)]) for i in range(episodes)],
         robot_type="maze2d",
         provenance={
             "environment": ENV_ID,
@@ -146,8 +152,8 @@ def build_maze2d(
     )
 
 
-def _pictures(maze: str, states: np.ndarray) -> Iterator[np.ndarray]:
-    """What the camera sees at each of (N, 4) states: x, y, goal x, goal y."""
-    parsed = parse_maze(maze)
-    for x, y, goal_x, goal_y in states.tolist():
-        yield camera_picture(parsed, (int(goal_x), int(goal_y)), (x, y))
+def _pictures(mazes: Sequence[str], states: np.ndarray) -> Iterator[np.ndarray]:
+    """What the camera sees at each of (N, 4) states of whole episodes: x, y, goal x, goal y."""
+    parsed = [parse_maze(maze) for maze in mazes]
+    for step, (x, y, goal_x, goal_y) in enumerate(states.tolist()):
+        yield camera_picture(parsed[step // HORIZON % len(parsed)], (int(goal_x), int(goal_y)), (x, y))

@@ -364,7 +364,7 @@ def test_the_expert_follows_the_published_rule():
 
 @pytest.mark.parametrize(("noise", "published"), [(0.5, 2.81), (0.0, 2.91)])
 def test_a_thousand_episodes_return_what_was_published(noise, published):
-    columns, _ = collect_episodes("medium", 1000, seed=0, noise=noise, progress=False)
+    columns, _ = collect_episodes(["medium"], 1000, seed=0, noise=noise, progress=False)
     states, actions = columns["observation.state"].reshape(1000, HORIZON, 4), columns["action"]
     assert columns["next.reward"].sum(dtype=np.float64) / 1000 == pytest.approx(published, abs=0.12)
     distances = np.linalg.norm(states[:, 0, :2] - states[:, 0, 2:], axis=-1)
@@ -417,16 +417,30 @@ def test_builds_are_determined_by_their_seed_and_begin_alike(built, tmp_path):
     frames, smaller = stored(built), stored(build_maze2d(tmp_path / "two", episodes=2, seed=1, progress=False))
     for name, column in smaller.items():
         np.testing.assert_array_equal(column, frames[name][: 2 * HORIZON])
-    other, _ = collect_episodes("medium", 2, seed=2, noise=0.5, progress=False)
+    other, _ = collect_episodes(["medium"], 2, seed=2, noise=0.5, progress=False)
     assert (other["observation.state"][0] != frames["observation.state"][0]).any()
-    calm, _ = collect_episodes("medium", 2, seed=1, noise=0.0, progress=False)
+    calm, _ = collect_episodes(["medium"], 2, seed=1, noise=0.0, progress=False)
     np.testing.assert_array_equal(calm["observation.state"][::HORIZON], smaller["observation.state"][::HORIZON])
     assert (calm["action"] != smaller["action"]).any()
+
+
+def test_each_of_several_mazes_is_a_task_that_its_environment_says(tmp_path):
+    """An episode of each in turn; the first is as if it were built alone."""
+    build_maze2d(tmp_path / "both", maze="umaze,medium", episodes=3, seed=1, progress=False)
+    meta = LeRobotDatasetMetadata("local/maze2d", root=tmp_path / "both")
+    told = [Maze2DEnv(maze).task_description for maze in ("umaze", "medium", "umaze")]
+    assert [list(meta.episodes[i]["tasks"]) for i in range(3)] == [[text] for text in told]
+    assert len(set(told)) == 2
+    frames = stored(tmp_path / "both")
+    assert [meta.tasks.index[i] for i in frames["task_index"][::HORIZON]] == told
+    alone, _ = collect_episodes(["umaze"], 1, seed=1, noise=0.5, progress=False)
+    np.testing.assert_array_equal(frames["observation.state"][:HORIZON], alone["observation.state"])
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"maze": "umaze,medium", "camera": True}, "one size"),
         ({"episodes": 0}, "episodes"),
         ({"seed": -1}, "seed"),
         ({"noise": -0.1}, "noise"),

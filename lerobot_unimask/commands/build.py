@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
     maze2d = add_command(environments, "maze2d", "a point mass in a maze, a waypoint controller")
     _dataset(maze2d, episodes=1000)
     maze2d.add_argument("--noise", type=float, default=0.5, help="standard deviation of the noise on actions")
-    maze2d.add_argument("--maze", default="medium", help="umaze, medium, large, or a maze's own text")
+    maze2d.add_argument("--maze", default="medium", help="umaze, medium, large, or a maze's own text; or several: A,B")
     _camera(maze2d)
     maze2d.add_argument(
         "--hide_goal", type=boolean, default=False, metavar="true", help="leave the goal out of the state"

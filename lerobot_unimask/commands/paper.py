@@ -1,6 +1,7 @@
 """`unimask paper ...`: what only the reproduction of the paper needs."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,22 @@ def _add_chunks(parts: Any) -> None:
     chunks.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
     output_flag(chunks)
     chunks.set_defaults(run=_chunks)
+
+    goals = add_command(parts, "goals", "Maze2D with --hide_goal=true: told of the goal by s[-1] alone, at every step")
+    policy_flags(goals)
+    goals.add_argument("--dataset.root", type=Path, required=True, dest="data", metavar="DIR", help="its episodes")
+    goals.add_argument("--episodes", type=positive, default=200, help="rollouts of each way of showing the goal")
+    goals.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
+    output_flag(goals)
+    goals.set_defaults(run=_goals)
+    tasks = add_command(parts, "tasks", "Maze2D, several mazes: each asked for, another asked for, and the task hidden")
+    policy_flags(tasks)
+    tasks.add_argument("--maze", required=True, help="the mazes of its data: A,B")
+    tasks.add_argument("--episodes", type=positive, default=200, help="rollouts of each question in each maze")
+    tasks.add_argument("--batch_size", type=positive, default=100, help="environments side by side")
+    tasks.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
+    output_flag(tasks)
+    tasks.set_defaults(run=_tasks)
 
 
 def _add_curve(parts: Any) -> None:
@@ -104,22 +121,45 @@ def _study(arguments: argparse.Namespace) -> None:
 
 
 def _chunks(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.data.checkpoints import last_checkpoint, training_settings
     from lerobot_unimask.paper.chunks import markdown, measure_chunks
-    from lerobot_unimask.records import write_json
 
-    folder = last_checkpoint(Path(arguments.path))
-    record = measure_chunks(
-        folder,
-        arguments.data,
-        episodes=arguments.episodes,
+    _measure_acting(
+        arguments,
+        measure_chunks,
+        markdown,
+        data=arguments.data,
         rtc_episodes=arguments.rtc_episodes,
         batch_size=arguments.batch_size,
         chunk_size=8,
         carried_out=(1, 4, 8),
         delays=(0, 2, 4, 8),
-        seed=arguments.seed,
     )
+
+
+def _goals(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.paper.chunks import measure_goals
+    from lerobot_unimask.paper.study_tables import goals_table
+
+    _measure_acting(arguments, measure_goals, goals_table, data=arguments.data, chunk_sizes=(8, 15))
+
+
+def _tasks(arguments: argparse.Namespace) -> None:
+    from lerobot_unimask.paper.chunks import measure_tasks
+    from lerobot_unimask.paper.study_tables import tasks_table
+
+    mazes = arguments.maze.split(",")
+    _measure_acting(arguments, measure_tasks, tasks_table, mazes=mazes, batch_size=arguments.batch_size)
+
+
+def _measure_acting(
+    arguments: argparse.Namespace, measure: Callable[..., dict], markdown: Callable[[dict], str], **settings: Any
+) -> None:
+    """Measure a checkpoint, print the tables and write the record."""
+    from lerobot_unimask.data.checkpoints import last_checkpoint, training_settings
+    from lerobot_unimask.records import write_json
+
+    folder = last_checkpoint(Path(arguments.path))
+    record = measure(folder, episodes=arguments.episodes, seed=arguments.seed, **settings)
     record["training"] = training_settings(folder)
     print(markdown(record))
     if arguments.output:
@@ -183,7 +223,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
 
     from lerobot_unimask.data.episodes import first_windows, middle_windows, open_dataset, provenance_of
     from lerobot_unimask.data.factors import STATE
-    from lerobot_unimask.envs.maze2d.record import maze_of
+    from lerobot_unimask.envs.maze2d.record import mazes_of
     from lerobot_unimask.modeling_unimask import UniMASKPolicy
     from lerobot_unimask.paper.gallery import doorkey_pictures, maze_pictures, write_gallery
 
@@ -193,7 +233,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
     if arguments.maze_path is not None:
         maze = UniMASKPolicy.from_pretrained(arguments.maze_path)
         dataset = open_dataset(maze.config, arguments.maze_root)
-        starts, walls = first_windows(dataset)[STATE][:, 0], maze_of(provenance_of(Path(dataset.root)))
+        starts, walls = first_windows(dataset)[STATE][:, 0], mazes_of(provenance_of(Path(dataset.root)))[0]
         pictures = chain(pictures, maze_pictures(maze, middle_windows(dataset), starts, walls=walls))
     for path in write_gallery(pictures, arguments.output, command=arguments.text):
         print(path)

@@ -1,4 +1,5 @@
-"""Chunks and real-time chunking on Maze2D: what they return, what they cost, and how far actions jump between chunks.
+"""Acting in Maze2D: what chunks and real-time chunking return and cost, and how far actions jump between chunks; what
+comes of goals a few steps ahead, and of tasks that are asked for or hidden.
 
 Legend of shapes: B environments, T steps, H actions of a chunk, D the numbers of an action.
 """
@@ -16,6 +17,8 @@ from torch import Tensor
 
 from lerobot_unimask.asking.acting import new_memory, plan
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
+from lerobot_unimask.envs.maze2d.expert import next_cells
+from lerobot_unimask.envs.maze2d.maze import HORIZON, task_of
 from lerobot_unimask.evaluating import rollout
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.paper.study_tables import acting_table, real_time_table
@@ -99,7 +102,7 @@ def act_in_real_time(
     returns, actions, seams = np.zeros(episodes), [], []
     planned = _ask(policy, states, 0, None)
     asked, asked_at = None, 0  # the first chunk is waited for
-    for step in range(Maze2DEnv._max_episode_steps):
+    for step in range(HORIZON):
         if asked is not None and step - asked_at == delay:
             planned, asked = asked[:, delay:], None
             seams.append(step - 1)
@@ -123,6 +126,116 @@ def _ask(policy: UniMASKPolicy, states: np.ndarray, delay: int, left: Tensor | N
     memory = new_memory(policy, len(states))
     memory.observe(torch.from_numpy(states), None)
     return plan(policy, memory, policy.config.chunk_size, prefix=None if left is None else left[:, :delay])
+
+
+def measure_goals(
+    checkpoint: Path, data: Path, *, episodes: int, chunk_sizes: Sequence[int], seed: int
+) -> dict[str, Any]:
+    """A JSON record: rollouts of a policy whose state is the position without the goal, which is told of the goal by
+    s[-1] alone, H - 1 steps from now at every step, beside imitation, which is told nothing.
+
+    Args:
+        data: folder of its dataset, which says how far the mass comes in H - 1 steps.
+        episodes: rollouts of each way, all from the same starts.
+        chunk_sizes: H; the last counts for goals of one moment of the episode too.
+    """
+    policy = UniMASKPolicy.from_pretrained(checkpoint)
+    frames = pyarrow.dataset.dataset(data / "data", format="parquet").to_table(["observation.state"])
+    positions = np.stack(frames["observation.state"].to_numpy()).reshape(-1, HORIZON, 2)
+    rows = []
+    for size in (1, *chunk_sizes):
+        far = (
+            0.0
+            if size == 1
+            else float(np.linalg.norm(positions[:, size - 1 :] - positions[:, : 1 - size], axis=-1).mean())
+        )
+        ways = ("nothing",) if size == 1 else ("goal", "straight", "walk")
+        for shown in (*ways, "moment") if size == chunk_sizes[-1] else ways:
+            policy.config.chunk_size = size
+            found = act_towards_goals(policy, episodes, shown, far, seed=seed)
+            rows.append({"chunk_size": size, "shown": shown, "cells": far, **found})
+            print(f"H = {size}, shown {shown}, within {far:.2f} cells: {found}", flush=True)
+    return {
+        "goals": rows,
+        "episodes": episodes,
+        "seed": seed,
+        "policy": policy.describe_origin(),
+        "versions": versions(),
+    }
+
+
+@torch.no_grad()
+def act_towards_goals(policy: UniMASKPolicy, episodes: int, shown: str, far: float, *, seed: int) -> dict[str, float]:
+    """Rollouts, one action after another.
+
+    Args:
+        shown: as s[-1] "nothing"; the "goal"; the point at most `far` on the way to it, "straight" or from cell to cell
+            on the shortest "walk"; or the goal for one "moment" of the episode, its last step.
+        far: cells.
+
+    Returns:
+        mean return, its standard error, and the share of successes.
+    """
+    environments = [Maze2DEnv(render_mode=None, hide_goal=True) for _ in range(episodes)]
+    positions = np.stack([env.reset(seed=seed + i)[0]["agent_pos"] for i, env in enumerate(environments)])
+    goals, returns = np.array([env.goal for env in environments], np.float32), np.zeros(episodes)
+    policy.reset()
+    for _ in range(HORIZON):
+        question: dict[str, Any] = {}
+        if shown == "moment":
+            question["given"] = {f"s@{HORIZON - 1}": torch.from_numpy(goals)}
+        elif shown != "nothing":
+            aims = goals if shown != "walk" else np.array([_next_on_walk(env) for env in environments], np.float32)
+            way = aims - positions
+            shorter = np.minimum(1, far / np.linalg.norm(way, axis=1, keepdims=True).clip(1e-6))
+            there = goals if shown == "goal" else positions + way * shorter
+            question = {"mask": "goal_conditioned", "given": {"s[-1]": torch.from_numpy(there)}}
+        actions = policy.select_action({"observation.state": torch.from_numpy(positions)}, **question)
+        results = [env.step(one) for env, one in zip(environments, actions.numpy(), strict=True)]
+        positions = np.stack([result[0]["agent_pos"] for result in results])
+        returns += [result[1] for result in results]
+    success = np.mean([result[4]["is_success"] for result in results]).item()
+    return {**_spread(torch.from_numpy(returns)), "success": success}
+
+
+def _next_on_walk(env: Maze2DEnv) -> tuple[int, int]:
+    """The next cell of the shortest walk to the goal, or the goal."""
+    nearest = min(env.maze.cells, key=lambda cell: np.hypot(cell[0] - env.position[0], cell[1] - env.position[1]))
+    return next_cells(env.maze, env.goal).get(nearest, env.goal)
+
+
+def measure_tasks(
+    checkpoint: Path, mazes: Sequence[str], *, episodes: int, batch_size: int, seed: int
+) -> dict[str, Any]:
+    """A JSON record: rollouts of lerobot-eval in each maze, of which each is a task of the policy's, asked for the task
+    of the maze, which the environment says, for each other, and with the task hidden."""
+    rows = []
+    for maze in mazes:
+        for asked in (*mazes, None):
+            question: dict[str, Any] = {}
+            if asked is None:
+                question["inference_mask"] = "a[t] | s[:t+1], a[:t]"
+            elif asked != maze:
+                question["given"] = {"task[0]": task_of(asked)}
+            result = rollout(
+                checkpoint,
+                "maze2d",
+                episodes,
+                batch_size=batch_size,
+                seed=seed,
+                environment={"maze": maze},
+                **question,
+            )
+            rows.append({"maze": maze, "asked": asked, **result})
+            print(f"in {maze}, asked for {asked}: {result['mean_return']:.3f}, {result['success']:.3f}", flush=True)
+    policy = UniMASKPolicy.from_pretrained(checkpoint)
+    return {
+        "tasks": rows,
+        "batch_size": batch_size,
+        "seed": seed,
+        "policy": policy.describe_origin(),
+        "versions": versions(),
+    }
 
 
 @contextmanager

@@ -150,6 +150,41 @@ def acting_table(record: Mapping[str, Any]) -> str:
     return markdown_table(("H", "carried out", "return", "success", "ms", "passes a step"), rows)
 
 
+SHOWN = {  # as s[-1], by its name in the record
+    "nothing": "nothing: imitation",
+    "goal": "the goal",
+    "straight": "towards it, {cells:.2f} cells from here",
+    "walk": "on the shortest walk, {cells:.2f} cells from here",
+    "moment": "the goal, as `s@199`",
+}
+
+
+def goals_table(record: Mapping[str, Any]) -> str:
+    rows = (
+        (
+            row["chunk_size"],
+            SHOWN[row["shown"]].format(**row),
+            f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
+            f"{row['success']:.3f}",
+        )
+        for row in record["goals"]
+    )
+    return markdown_table(("H", "shown as `s[-1]`", "return", "success"), rows)
+
+
+def tasks_table(record: Mapping[str, Any]) -> str:
+    rows = (
+        (
+            f"`{row['maze']}`",
+            "nothing: hidden" if row["asked"] is None else f"`{row['asked']}`",
+            f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
+            f"{row['success']:.3f}",
+        )
+        for row in record["tasks"]
+    )
+    return markdown_table(("in the maze", "asked for", "return", "success"), rows)
+
+
 def real_time_table(record: Mapping[str, Any]) -> str:
     rows = (
         (

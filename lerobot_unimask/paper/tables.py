@@ -360,6 +360,8 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"h = 1": _remembered_returns,
     r"H \| carried out": study_tables.acting_table,
     r"delay \| mask": study_tables.real_time_table,
+    r"in the maze": study_tables.tasks_table,
+    r"H \| shown": study_tables.goals_table,
     r"model \| BC": study_tables.returns_table,
     r"trained on, nats": study_tables.losses_table,
     r"trained on, over": study_tables.normalised_table,

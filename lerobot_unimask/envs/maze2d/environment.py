@@ -28,11 +28,11 @@ from lerobot_unimask.envs.maze2d.maze import (
     START_SPEED,
     START_SPREAD,
     SUCCESS_DISTANCE,
-    TASK,
     WALL_OFFSET,
     Cell,
     Maze,
     parse_maze,
+    task_of,
 )
 from lerobot_unimask.envs.maze2d.rendering import camera_picture, draw_maze
 
@@ -93,7 +93,6 @@ class Maze2DEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (gymnasium's own way)
     task = "Maze2D-v0"
-    task_description = TASK
     _max_episode_steps = HORIZON  # LeRobot reads it from the environment itself
 
     def __init__(
@@ -105,7 +104,7 @@ class Maze2DEnv(gym.Env):
     ):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Maze2D draws to arrays only: render_mode must be 'rgb_array', got {render_mode!r}.")
-        self.maze = parse_maze(maze)
+        self.maze, self.task_description = parse_maze(maze), task_of(maze)
         self.render_mode = render_mode
         self.obs_type, self.hide_goal = check_obs_type(obs_type), hide_goal
         spaces: dict[str, gym.Space] = {

@@ -67,6 +67,11 @@ MAZES = {
 Cell = tuple[int, int]
 
 
+def task_of(maze: str) -> str:
+    """What an episode is to do: each maze is a task of its own; the medium one's text does not name it."""
+    return TASK if maze == "medium" else f"{TASK} ({maze})"
+
+
 @dataclass(frozen=True)
 class Maze:
     """A checked maze: `rows` of equal length, and its free cells as (row, column), in reading order."""

@@ -16,20 +16,22 @@ from lerobot_unimask.language.masks import ASKABLE, Mask
 def _draw_answer(
     question: str, answer: Answer | Samples, mask: Mask, recorded: Window | None, provenance: Provenance
 ) -> Figure | None:
-    """Where the mass is over the maze, if states are asked, and no return or property is."""
+    """Where the mass is over the maze, if states are asked, and no return or property is, and there is one maze."""
     beside = any(asked.any() for name, asked in mask.asked.items() if name not in ASKABLE)
-    if isinstance(answer, Samples) or beside or not mask.asked["s"].any():
+    mazes = mazes_of(provenance)
+    if isinstance(answer, Samples) or beside or not mask.asked["s"].any() or len(mazes) > 1:
         return None
-    return maze_trajectories(answer, recorded, maze=maze_of(provenance))
+    return maze_trajectories(answer, recorded, maze=mazes[0])
 
 
 def _draw_episodes(states: np.ndarray, provenance: Provenance) -> Figure:
-    return draw_ways(states, maze_of(provenance))
+    mazes = mazes_of(provenance)
+    return draw_ways(states[:: len(mazes)], mazes[0])
 
 
-def maze_of(provenance: Provenance) -> str:
-    """The maze, a name or text, that a dataset was built in."""
-    return provenance.get("maze", "medium")
+def mazes_of(provenance: Provenance) -> list[str]:
+    """The mazes, names or texts, that a dataset was built in, an episode of each in turn."""
+    return provenance.get("maze", "medium").split(",")
 
 
 MAZE2D = Environment(
