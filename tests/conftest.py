@@ -12,6 +12,36 @@ torch.set_num_threads(1)  # two threads beside another busy process are many tim
 
 EPISODES = 30
 
+# --- Processor time, which does not depend on who else is at work; processes that tests start count too ---------------
+
+SPENT = {}  # test -> seconds, its fixtures' included
+
+
+def processor_seconds():
+    return sum(os.times()[:4])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    before = processor_seconds()
+    try:
+        return (yield)
+    finally:
+        SPENT[item.nodeid] = processor_seconds() - before
+
+
+def pytest_addoption(parser):
+    parser.addoption("--costly", type=int, default=0, metavar="N", help="list the N tests of most processor time")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    terminalreporter.write_line(f"{processor_seconds():.0f} s of processor time, {sum(SPENT.values()):.0f} s in tests")
+    for test in sorted(SPENT, key=SPENT.get, reverse=True)[: config.getoption("--costly")]:
+        terminalreporter.write_line(f"{SPENT[test]:8.2f} s  {test}")
+
+
+# --- What tests share ------------------------------------------------------------------------------------------------
+
 
 @pytest.fixture(scope="session", autouse=True)
 def plugin():

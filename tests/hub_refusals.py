@@ -4,7 +4,6 @@ Run by `test_hub.py` after `hub_flow.py` and in its process, with the dataset an
 """
 
 import shutil
-from pathlib import Path
 
 import pytest
 from hub_flow import HOME, HUB, command, head
@@ -25,7 +24,7 @@ def push(capsys, *arguments: str) -> str:
     return capsys.readouterr().err
 
 
-def test_a_dataset_refused_at_its_tag_says_what_is_there(capsys) -> None:
+def test_a_dataset_refused_at_its_tag_says_what_is_there(capsys):
     flags = [f"--dataset.root={ROOT}", "--repo_id=me/untagged"]
     with HUB.fault(r"POST .*/tag/", status=403):
         said = push(capsys, *flags)
@@ -37,7 +36,7 @@ def test_a_dataset_refused_at_its_tag_says_what_is_there(capsys) -> None:
 
 
 @pytest.mark.parametrize(("flag", "source"), [("--dataset.root", ROOT), ("--policy.path", CHECKPOINT)])
-def test_a_link_out_of_the_folder_is_not_pushed(flag: str, source: Path, tmp_path: Path, capsys) -> None:
+def test_a_link_out_of_the_folder_is_not_pushed(flag, source, tmp_path, capsys):
     folder = tmp_path / "folder"
     shutil.copytree(source, folder)
     (tmp_path / "secret.json").write_text("{}")
@@ -49,7 +48,7 @@ def test_a_link_out_of_the_folder_is_not_pushed(flag: str, source: Path, tmp_pat
 
 
 @pytest.mark.parametrize("status", [404, 429, 500, 503])
-def test_what_the_hub_answers_a_push_is_said(status: int, capsys, monkeypatch) -> None:
+def test_what_the_hub_answers_a_push_is_said(status, capsys, monkeypatch):
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)  # the client tries again by itself
     with HUB.fault(r"POST /api/repos/create", status=status):
         said = push(capsys, f"--policy.path={CHECKPOINT}", f"--repo_id=me/status_{status}")
@@ -57,14 +56,14 @@ def test_what_the_hub_answers_a_push_is_said(status: int, capsys, monkeypatch) -
     assert "nothing of this push is to be seen there" in said
 
 
-def test_a_login_page_in_place_of_the_hub_is_named_when_pushing(capsys) -> None:
+def test_a_login_page_in_place_of_the_hub_is_named_when_pushing(capsys):
     with HUB.fault(r"GET /api/models/", page=True):
         assert "is not a Hub" in push(capsys, f"--policy.path={CHECKPOINT}", "--repo_id=me/portal")
 
 
 @pytest.mark.parametrize("status", [403, 404, 429, 500, 503])
 @pytest.mark.parametrize("kind", ["policy", "dataset"])
-def test_what_the_hub_answers_a_pull_is_said(kind: str, status: int, monkeypatch) -> None:
+def test_what_the_hub_answers_a_pull_is_said(kind, status, monkeypatch):
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)  # the client tries again by itself
     with HUB.fault(r"(GET|HEAD) /api/", status=status), pytest.raises(HubError, match=rf"status {status}") as error:
         pull(kind)
@@ -73,7 +72,7 @@ def test_what_the_hub_answers_a_pull_is_said(kind: str, status: int, monkeypatch
 
 
 @pytest.mark.parametrize("kind", ["policy", "dataset"])
-def test_a_login_page_in_place_of_the_hub_is_named(kind: str) -> None:
+def test_a_login_page_in_place_of_the_hub_is_named(kind):
     with HUB.fault(r"(GET|HEAD) ", page=True), pytest.raises(HubError, match="is not a Hub"):
         pull(kind)
 

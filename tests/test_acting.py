@@ -182,11 +182,7 @@ def test_given_and_target_return_cannot_both_name_the_return(tiny_policy):
 
 @pytest.mark.parametrize(
     "settings",
-    [
-        {"target_return": 6.0},
-        {"given": {"rtg[0]": 6.0}},
-        {"inference_mask": "a[t] | s[t]", "given": {"rtg[0]": 6.0}},
-    ],
+    [{"target_return": 6.0}, {"given": {"rtg[0]": 6.0}}, {"inference_mask": "a[t] | s[t]", "given": {"rtg[0]": 6.0}}],
 )
 def test_a_value_that_the_inference_mask_never_shows_is_refused_when_the_policy_is_made(tiny_policy, settings):
     with pytest.raises(ValueError, match=r"is given, but the mask does not show it"):

@@ -12,7 +12,7 @@ ATTACK = Path(__file__).with_name("measuring") / "attack.py"
 
 
 @pytest.mark.slow
-def test_nothing_is_lost(tmp_path) -> None:
+def test_nothing_is_lost(tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
     done = subprocess.run(
         [sys.executable, ATTACK, "--share=0.02", f"--output={tmp_path / 'record.json'}"],

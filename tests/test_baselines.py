@@ -50,16 +50,6 @@ def window_and_shown(policy, batch, seed=0):
 # --- What the Decision Transformer must keep; the others: test_networks.py -------------------------------------------
 
 
-def test_predictions_have_the_same_form_for_every_network(policy, doorkey_batch):
-    tested, usual = policy("decision_transformer"), policy("transformer")
-    window, shown = window_and_shown(tested, doorkey_batch)
-    expected = usual.network(window, shown)
-    predictions = tested.network(window, shown)
-    assert list(predictions) == ["s", "a"]  # the transformer alone is asked for returns, too
-    for name, outputs in predictions.items():
-        assert [output.shape for output in outputs] == [output.shape for output in expected[name]]
-
-
 def test_a_hidden_value_changes_nothing_not_even_a_nan(policy, doorkey_batch):
     """A Decision Transformer reads the later returns where the first is shown: those are shown with it."""
     tested = policy("decision_transformer")

@@ -15,7 +15,6 @@ from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.measures import action_error
-from lerobot_unimask.networks import vision
 from lerobot_unimask.sharing import cards
 from lerobot_unimask.validation import task_losses
 
@@ -91,13 +90,6 @@ def test_random_masks_hide_pictures_token_by_token():
         assert mask.shown[name][mask.causal].all()
         assert mask.shown[name][both].float().mean(0) == pytest.approx([0.5] * K, abs=0.05)
     assert (mask.shown["top"] != mask.shown["wrist"])[both].any(0).all()
-
-
-def test_without_cameras_masks_are_what_they_were():
-    valid, index = torch.ones(50, K, dtype=torch.bool), torch.arange(50)
-    one, other = (TrainingMasks("random_mask", ("s", "a"), K, causal_share=0.5, **kw) for kw in ({}, {"cameras": ()}))
-    one, other = (draw(valid, index, seed=1, step=2) for draw in (one, other))
-    assert all(torch.equal(one.shown[name], other.shown[name]) for name in ("s", "a"))
 
 
 # --- Leaks -----------------------------------------------------------------------------------------------------------
@@ -282,14 +274,6 @@ def test_samples_are_drawn_given_pictures(make, batch):
 # --- Settings and checkpoints ----------------------------------------------------------------------------------------
 
 
-def test_saved_and_loaded_it_answers_the_same(make, batch, tmp_path):
-    policy = make()
-    policy.save_pretrained(tmp_path)
-    loaded = UniMASKPolicy.from_pretrained(tmp_path).eval()
-    assert list(loaded.cameras) == list(CAMERAS)
-    assert_same_answers(loaded.infer(batch, "behavior_cloning", t=3), policy.infer(batch, "behavior_cloning", t=3))
-
-
 def test_a_checkpoint_from_before_cameras_loads(tiny_policy, tmp_path):
     tiny_policy("gaussian").save_pretrained(tmp_path)
     path = tmp_path / "config.json"
@@ -332,22 +316,6 @@ def test_what_looks_learns_at_a_rate_of_its_own(make):
 def test_a_resnet_looks(make, batch):
     policy = make(vision_backbone="resnet18", image_size=[64, 64], cameras=["observation.images.top"])
     assert policy.select_action(observation(batch, 0)).isfinite().all()
-
-
-def test_pictures_of_another_size_are_resized_which_is_said_once(make, batch, caplog):
-    vision._say_once.cache_clear()
-    policy, larger = make(), observation(batch, 0)
-    for key in COLUMNS.values():
-        larger[key] = torch.nn.functional.interpolate(larger[key], scale_factor=2, mode="nearest")
-    resized = {**larger, **{key: frames.resized(larger[key], (SIDE, SIDE)) for key in COLUMNS.values()}}
-    actions = []
-    for shown in (larger, larger, resized):
-        policy.reset()
-        actions.append(policy.select_action(shown))
-    torch.testing.assert_close(actions[0], actions[2])
-    said = [message for message in caplog.messages if "32 x 32" in message]
-    assert len(said) == 1
-    assert f"{SIDE} x {SIDE}" in said[0]
 
 
 def test_one_picture_serves_all_steps_of_a_causal_window(make, batch):

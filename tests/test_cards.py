@@ -37,10 +37,11 @@ def card(policy, repo_id="me/policy", results=(), **told):
     return cards.policy_card(facts, repo_id, results)
 
 
-def test_a_policy_s_card_draws_the_questions_it_was_trained_on(tiny_policy) -> None:
+def test_a_policy_s_card_draws_the_questions_it_was_trained_on(tiny_policy):
     policy = tiny_policy(training_masks={"goal_conditioned": 3, "s[1:9] | s[0]": 1, "random_mask": 4})
     metadata, body = read(card(policy, "me/policy", train_config=TRAIN_CONFIG, command="lerobot-train x"))
-    assert metadata["library_name"] == "lerobot"
+    found = [metadata[name] for name in ("library_name", "license", "pipeline_tag")]
+    assert found == ["lerobot", "apache-2.0", "robotics"]
     assert metadata["datasets"] == ["me/doorkey"]
     assert "goal_conditioned (38%): a[t] | s[:t+1], a[:t], s[-1]   at t = 5" in body
     assert "s ######...#  a #####?....  rtg .........." in body
@@ -54,12 +55,12 @@ def test_a_policy_s_card_draws_the_questions_it_was_trained_on(tiny_policy) -> N
 
 
 @pytest.mark.parametrize("masks", [["random_mask", "past"], "random_mask"])
-def test_the_question_to_try_is_one_that_can_be_asked(tiny_policy, masks) -> None:
+def test_the_question_to_try_is_one_that_can_be_asked(tiny_policy, masks):
     body = read(card(tiny_policy(training_masks=masks), "me/policy"))[1]
     assert f"--mask={'past' if len(masks) == 2 else 'behavior_cloning'} --t=" in body
 
 
-def test_a_policy_s_card_says_which_data(tiny_policy) -> None:
+def test_a_policy_s_card_says_which_data(tiny_policy):
     policy = tiny_policy()
     local = {"dataset": {"repo_id": "local/doorkey", "root": "data/door key"}, "env": None}
     metadata, body = read(card(policy, "me/policy", train_config=local))
@@ -73,7 +74,7 @@ def test_a_policy_s_card_says_which_data(tiny_policy) -> None:
     assert "How it was trained was not saved" in read(card(policy, "me/p"))[1]
 
 
-def test_a_policy_s_card_has_the_results_that_it_is_given(tiny_policy) -> None:
+def test_a_policy_s_card_has_the_results_that_it_is_given(tiny_policy):
     folder = Path(__file__).parent.parent / "docs" / "results"
     names = ("doorkey_20000.json", "doorkey_20000_most_likely.json")
     records = [json.loads((folder / name).read_text()) for name in names]
@@ -84,13 +85,13 @@ def test_a_policy_s_card_has_the_results_that_it_is_given(tiny_policy) -> None:
         card(tiny_policy(), "me/policy", results=[{"loss": 1}])
 
 
-def test_the_card_of_a_continuous_model_without_data(tiny_policy) -> None:
+def test_the_card_of_a_continuous_model_without_data(tiny_policy):
     body = read(card(tiny_policy("gaussian", context_length=5), "me/policy"))[1]
     assert "| `s` | `observation.state` | 3 | x, y, goal | continuous |" in body
     assert "--env.type=YOUR_ENVIRONMENT" in body
 
 
-def test_a_dataset_s_card_says_how_it_was_made(doorkey_root: Path) -> None:
+def test_a_dataset_s_card_says_how_it_was_made(doorkey_root):
     metadata, body = read(cards.dataset_card(doorkey_root, "me/doorkey", DOORKEY))
     assert metadata["license"] == "apache-2.0"
     assert metadata["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
@@ -101,14 +102,14 @@ def test_a_dataset_s_card_says_how_it_was_made(doorkey_root: Path) -> None:
     assert "lerobot-train --policy.type=unimask --policy.push_to_hub=false --dataset.repo_id=me/doorkey" in body
 
 
-def test_maze2d_s_card(tmp_path: Path) -> None:
+def test_maze2d_s_card(tmp_path):
     root = build_maze2d(tmp_path / "maze", episodes=2, noise=0.25, maze="umaze", progress=False)
     body = read(cards.dataset_card(root, "me/maze", MAZE2D))[1]
     assert "- settings: noise 0.25, maze umaze, seed 0" in body
     assert "Maze2D, a point mass" in body
 
 
-def test_any_other_dataset_has_a_card_too(doorkey_root: Path, tmp_path: Path) -> None:
+def test_any_other_dataset_has_a_card_too(doorkey_root, tmp_path):
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_bytes((doorkey_root / "meta" / "info.json").read_bytes())
     files = cards.dataset_card(tmp_path, "me/other")
@@ -119,7 +120,7 @@ def test_any_other_dataset_has_a_card_too(doorkey_root: Path, tmp_path: Path) ->
 HOSTILE = "a\n# no title\n```\n<script>alert(1)</script> | [link](https://evil.example) `code`"
 
 
-def test_nothing_that_a_name_holds_becomes_markdown_or_html(tiny_policy) -> None:
+def test_nothing_that_a_name_holds_becomes_markdown_or_html(tiny_policy):
     """Names, datasets, environments, commands and tasks of a policy's card, each as in a file that somebody made."""
     features = {
         "observation.state": {"dtype": "float32", "shape": (2,), "names": [HOSTILE, "plain"]},
@@ -133,7 +134,7 @@ def test_nothing_that_a_name_holds_becomes_markdown_or_html(tiny_policy) -> None
 
 
 @pytest.mark.parametrize("field", ["expert", "command", "seed", "beta", "package_version", "names", "dtype", "column"])
-def test_nothing_that_a_dataset_s_files_hold_becomes_markdown_or_html(doorkey_root: Path, tmp_path, field) -> None:
+def test_nothing_that_a_dataset_s_files_hold_becomes_markdown_or_html(doorkey_root, tmp_path, field):
     root = tmp_path / "dataset"
     shutil.copytree(doorkey_root, root)
     info, provenance = (json.loads((root / "meta" / f"{name}.json").read_text()) for name in ("info", "provenance"))
@@ -196,7 +197,7 @@ def check_tame(files: dict[str, bytes]) -> None:
         ("video_path", "../{video_key}.mp4"),
     ],
 )
-def test_an_entry_of_info_json_that_cannot_be_is_named(doorkey_root: Path, tmp_path: Path, entry, value) -> None:
+def test_an_entry_of_info_json_that_cannot_be_is_named(doorkey_root, tmp_path, entry, value):
     (tmp_path / "meta").mkdir()
     info = json.loads((doorkey_root / "meta" / "info.json").read_text())
     (tmp_path / "meta" / "info.json").write_text(json.dumps(info | {entry: value}))
@@ -207,13 +208,8 @@ def test_an_entry_of_info_json_that_cannot_be_is_named(doorkey_root: Path, tmp_p
 
 
 @pytest.mark.parametrize("text", ["[]", "3", '"x"', "{", "[" * 10_000, "\x00"])
-def test_an_info_json_that_is_no_mapping_is_named(tmp_path: Path, text: str) -> None:
+def test_an_info_json_that_is_no_mapping_is_named(tmp_path, text):
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text(text)
     with pytest.raises(ValueError, match=r"info.json (holds a|cannot be read)"):
         check_folder(tmp_path)
-
-
-def test_a_card_is_the_same_twice(tiny_policy) -> None:
-    """So that pushing again changes nothing."""
-    assert card(tiny_policy(), "me/policy") == card(tiny_policy(), "me/policy")

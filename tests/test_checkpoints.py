@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy
 from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same_answers, random_question, roll
 from safetensors.torch import load_file, save_file
 
-from lerobot_unimask import UniMASKConfig, UniMASKPolicy
+from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.data.checkpoints import checkpoints_of, last_checkpoint
 
 
@@ -64,10 +64,8 @@ def spoil(folder, change):
         (lambda w: w.pop("network.norm.weight"), r"missing network\.norm\.weight"),
         (lambda w: w.pop("statistics.a_mean"), r"missing statistics\.a_mean"),
         (lambda w: w.update(surplus=torch.zeros(1)), "extra surplus"),
-        (
-            lambda w: w.update({"network.positions": torch.zeros(7, 16)}),
-            r"network\.positions has shape \(7, 16\) instead of",
-        ),
+        (lambda w: w.update({"network.positions": torch.zeros(7, 16)}), r"network\.positions has shape \(7, 16\) in"),
+        (lambda w: (w.pop("updates"), w.update(surplus=torch.zeros(1))), "missing updates; extra surplus"),
     ],
 )
 def test_other_weights_are_refused_by_name(tiny_policy, tmp_path, change, message):
@@ -149,11 +147,10 @@ def test_a_checkpoint_that_was_being_written_is_never_taken(run, file, written, 
         assert checkpoints_of(run)[-1].parent.name == "1000000"
 
 
-def test_every_fault_of_the_weights_is_named_at_once(tiny_policy, tmp_path):
-    tiny_policy().save_pretrained(tmp_path)
-    spoil(tmp_path, lambda w: (w.pop("updates"), w.update(surplus=torch.zeros(1))))
-    with pytest.raises(ValueError, match=r"missing updates; extra surplus"):
-        UniMASKPolicy.from_pretrained(tmp_path)
+def test_last_is_followed_to_an_older_checkpoint(run):
+    (run / "checkpoints" / "last").unlink()
+    (run / "checkpoints" / "last").symlink_to("900000")
+    assert last_checkpoint(run).parent.name == "900000"
 
 
 def test_a_truncated_or_absent_file_is_refused(tiny_policy, tmp_path):
@@ -192,41 +189,9 @@ def test_fine_tuning_takes_the_new_datasets_statistics(tiny_policy, tmp_path, co
     torch.testing.assert_close(after.nan_to_num(0), 10 * before.nan_to_num(0), rtol=1e-4, atol=1e-3)
 
 
-def test_make_policy_goes_on_from_a_checkpoint(tiny_policy, doorkey, tmp_path):
-    tiny_policy().save_pretrained(tmp_path)
-    config = UniMASKConfig.from_pretrained(tmp_path)
-    config.pretrained_path = tmp_path
-    policy = make_policy(config, ds_meta=doorkey.meta)
-    assert policy.config.features == tiny_policy().config.features
-    assert torch.equal(policy.network.positions, tiny_policy().network.positions)
-
-
-def test_at_evaluation_the_environment_does_not_change_the_model(tiny_policy, tmp_path):
-    from lerobot_unimask.envs.configs import DoorKeyEnvConfig
-
-    tiny_policy().save_pretrained(tmp_path)
-    config = UniMASKConfig.from_pretrained(tmp_path)
-    config.pretrained_path = tmp_path
-    policy = make_policy(config, env_cfg=DoorKeyEnvConfig())
-    assert list(policy.factors) == ["s", "a", "rtg"]
-    assert policy.config.output_features["action"] == PolicyFeature(FeatureType.ACTION, (1,))
-    assert policy.select_action({"observation.state": torch.zeros(2, 2)}).dtype == torch.int64
-
-
-def test_a_checkpoint_says_what_it_is_in_plain_json(tiny_policy, tmp_path):
-    tiny_policy(training_masks={"past": 2.0, "random_mask": 1.0}).save_pretrained(tmp_path)
-    stored = json.loads((tmp_path / "config.json").read_text())
-    assert stored["type"] == "unimask"
-    assert stored["training_masks"] == {"past": 2.0, "random_mask": 1.0}
-    (state,) = stored["features"]["s"]
-    expected = {"key": "observation.state", "size": 2, "categories": [16, 16], "names": ["agent_cell", "key_cell"]}
-    assert state.items() >= expected.items()
-
-
 def test_a_checkpoint_keeps_how_its_training_episodes_began(tmp_path, doorkey_root, tiny_policy):
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.policies.factory import make_policy
 
     meta = LeRobotDatasetMetadata("local/doorkey", root=doorkey_root)
     config = tiny_policy(target_return="auto", inference_mask="reward_conditioned").config
@@ -331,22 +296,3 @@ def test_gaussians_go_on_as_a_mixture_whose_parts_begin_at_their_means(network, 
         torch.testing.assert_close(mixture.means[asked], one.unsqueeze(1).expand(-1, 3, -1))
         torch.testing.assert_close(mixture.scales[asked][:, 0], wide)
         assert (mixture.scales[asked].diff(dim=1) < 0).all()
-
-
-def test_another_kind_of_policy_is_named(tmp_path):
-    (tmp_path / "config.json").write_text('{"type": "act"}')
-    with pytest.raises(ValueError, match="type 'act'"):
-        UniMASKPolicy.from_pretrained(tmp_path)
-
-
-@pytest.mark.parametrize("half_written", ["1000000", "000030"])
-def test_a_run_is_its_last_whole_checkpoint(tiny_policy, tmp_path, half_written):
-    """`last` is followed; without it numbers are compared as numbers, and one without weights does not count."""
-    for updates in ("000020", "100000", "1000001"):
-        tiny_policy().save_pretrained(tmp_path / "checkpoints" / updates / "pretrained_model")
-    broken = tmp_path / "checkpoints" / half_written / "pretrained_model"
-    broken.mkdir(parents=True)
-    (broken / "config.json").write_text('{"type": "unimask"}')
-    assert last_checkpoint(tmp_path).parent.name == "1000001"
-    (tmp_path / "checkpoints" / "last").symlink_to("100000")
-    assert last_checkpoint(tmp_path).parent.name == "100000"

@@ -39,7 +39,7 @@ def files(folder: Path) -> dict[str, bytes]:
     ],
     ids=" ".join,
 )
-def test_a_mistyped_command_says_what_is_meant(arguments, expected, refused, tmp_path, monkeypatch) -> None:
+def test_a_mistyped_command_says_what_is_meant(arguments, expected, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert expected in refused(*arguments)
     assert not files(tmp_path)
@@ -48,7 +48,7 @@ def test_a_mistyped_command_says_what_is_meant(arguments, expected, refused, tmp
 # --- Building --------------------------------------------------------------------------------------------------------
 
 
-def test_build_makes_the_same_files_from_the_same_seed(tmp_path, capsys) -> None:
+def test_build_makes_the_same_files_from_the_same_seed(tmp_path, capsys):
     for folder, seed in (("one", 3), ("two", 3), ("other", 4)):
         cli.main(["build", "doorkey", "--episodes=20", f"--seed={seed}", f"--root={tmp_path / folder / 'data'}"])
     said = capsys.readouterr().out.splitlines()
@@ -61,7 +61,7 @@ def test_build_makes_the_same_files_from_the_same_seed(tmp_path, capsys) -> None
 
 
 @pytest.mark.parametrize(("place", "fault"), [(".", "folder is not empty"), ("thesis.txt", "is a file")])
-def test_build_refuses_a_place_that_is_taken_before_any_work(place, fault, refused, tmp_path, monkeypatch) -> None:
+def test_build_refuses_a_place_that_is_taken_before_any_work(place, fault, refused, tmp_path, monkeypatch):
     monkeypatch.setattr(dataset_builders.doorkey, "rollout", None)
     (tmp_path / "thesis.txt").write_text("three years of work")
     said = refused("build", "doorkey", "--episodes=20", "--root", tmp_path / place)
@@ -75,7 +75,7 @@ def test_build_refuses_a_place_that_is_taken_before_any_work(place, fault, refus
     [(dataset_builders.doorkey, "rollout"), (dataset_builders.writer, "_write_provenance")],
     ids=["while rolling out", "while writing"],
 )
-def test_an_interrupted_build_leaves_nothing(module, function, tmp_path, monkeypatch) -> None:
+def test_an_interrupted_build_leaves_nothing(module, function, tmp_path, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
@@ -89,12 +89,12 @@ def test_an_interrupted_build_leaves_nothing(module, function, tmp_path, monkeyp
 
 
 @pytest.fixture
-def checkpoint(tiny_policy, tmp_path) -> Path:
+def checkpoint(tiny_policy, tmp_path):
     tiny_policy().save_pretrained(tmp_path / "checkpoint")
     return tmp_path / "checkpoint"
 
 
-def test_validate_prints_each_tasks_loss_and_writes_the_record(checkpoint, doorkey_root, tmp_path, capsys) -> None:
+def test_validate_prints_each_tasks_loss_and_writes_the_record(checkpoint, doorkey_root, tmp_path, capsys):
     record = tmp_path / "results" / "validation.json"
     cli.main(["validate", f"--policy.path={checkpoint}", f"--dataset.root={doorkey_root}", f"--output={record}"])
     said = capsys.readouterr().out

@@ -36,23 +36,19 @@ def replace_main(monkeypatch: pytest.MonkeyPatch, main) -> None:
 @pytest.mark.parametrize(
     ("code", "status", "printed"), [(None, 0, ""), (0, 0, ""), (3, 3, ""), (True, 1, ""), ("why", 1, "why\n")]
 )
-def test_the_exit_status_is_that_of_a_console_script(
-    code: object, status: int, printed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_exit_status_is_that_of_a_console_script(code, status, printed, tmp_path, monkeypatch):
     replace_main(monkeypatch, lambda: sys.exit(code))
     assert commands.run("any", cwd=tmp_path) == commands.Result(status, "", printed)
 
 
-def test_an_error_is_a_traceback_and_status_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_is_a_traceback_and_status_one(tmp_path, monkeypatch):
     replace_main(monkeypatch, lambda: 1 / 0)
     result = commands.run("any", cwd=tmp_path)
     assert (result.status, result.stdout) == (1, "")
     assert result.stderr.endswith("ZeroDivisionError: division by zero\n")
 
 
-def test_a_command_has_its_own_arguments_folder_and_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_command_has_its_own_arguments_folder_and_environment(tmp_path, monkeypatch):
     replace_main(monkeypatch, lambda: print(sys.argv, Path.cwd(), os.environ["WHERE"], sys.stdin.read()))
     before = sys.argv, Path.cwd(), dict(os.environ)
     printed = commands.check("any", "--flag=1", cwd=tmp_path, env={"WHERE": "here"})
@@ -60,7 +56,7 @@ def test_a_command_has_its_own_arguments_folder_and_environment(
     assert (sys.argv, Path.cwd(), dict(os.environ)) == before
 
 
-def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path, monkeypatch):
     def start_and_wait() -> None:
         started = subprocess.Popen(["sleep", "60"])
         Path("started").write_text(str(started.pid))
@@ -76,7 +72,7 @@ def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path: Path, m
 
 
 @pytest.mark.slow
-def test_a_forked_training_and_its_answer_are_those_of_real_processes(doorkey_root: Path, tmp_path: Path) -> None:
+def test_a_forked_training_and_its_answer_are_those_of_real_processes(doorkey_root, tmp_path):
     dataset = ["--dataset.repo_id=local/doorkey", f"--dataset.root={doorkey_root}"]
     query = ["query", "--policy.path=run", *dataset, "--episode=0", "--mask=past", "--t=3", "--json"]
     weights, answers = [], []
@@ -92,9 +88,3 @@ def test_a_forked_training_and_its_answer_are_those_of_real_processes(doorkey_ro
     assert answers[0] == answers[1] != []
     assert weights[0].keys() == weights[1].keys()
     assert [key for key in weights[0] if not weights[0][key].equal(weights[1][key])] == []
-
-
-def test_a_refusal_of_the_real_script_is_status_two_with_nothing_on_stdout(tmp_path: Path) -> None:
-    result = commands.run("unimask", "query", "--policy.path=nowhere", cwd=tmp_path)
-    assert (result.status, result.stdout) == (2, "")
-    assert "nowhere" in result.stderr

@@ -34,12 +34,12 @@ def opening(path: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module", params=TRAINING, ids=str)
-def path(request: pytest.FixtureRequest) -> Path:
+def path(request):
     return request.param
 
 
 @pytest.fixture(scope="module")
-def config(path: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainPipelineConfig:
+def config(path, tmp_path_factory):
     """As lerobot-train reads it, up to the point where it would load the dataset. Not to be written to."""
     register_third_party_plugins()
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -50,7 +50,7 @@ def config(path: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainPipelin
     return config
 
 
-def test_it_opens_with_the_commands_that_use_it(path: Path, config: TrainPipelineConfig) -> None:
+def test_it_opens_with_the_commands_that_use_it(path, config):
     lines = opening(path)
     assert f"uv run lerobot-train --config_path={path}" in lines
     (build,) = (line for line in lines if line.startswith("uv run unimask build "))
@@ -65,7 +65,7 @@ def test_it_opens_with_the_commands_that_use_it(path: Path, config: TrainPipelin
         assert arguments.root == root
 
 
-def test_lerobot_reads_it_and_knows_each_setting(path: Path, config: TrainPipelineConfig) -> None:
+def test_lerobot_reads_it_and_knows_each_setting(path, config):
     assert isinstance(config.policy, UniMASKConfig)
     assert not config.policy.push_to_hub
     assert config.num_workers == 0  # windows are read in batches, faster than a worker can pass them on
@@ -74,7 +74,7 @@ def test_lerobot_reads_it_and_knows_each_setting(path: Path, config: TrainPipeli
     assert config.eval_steps == 0 or config.dataset.eval_split > 0
 
 
-def test_its_masks_fit_its_window(config: TrainPipelineConfig) -> None:
+def test_its_masks_fit_its_window(config):
     policy = config.policy
     factors = ("s", "a", "rtg", *(name.removeprefix("observation.") for name in policy.properties))
     cameras = ("top",)  # what the environments' datasets may have
@@ -84,7 +84,7 @@ def test_its_masks_fit_its_window(config: TrainPipelineConfig) -> None:
 
 
 @pytest.mark.parametrize("path", GRIDS, ids=str)
-def test_a_grid_opens_with_its_command_which_reads_it(path: Path) -> None:
+def test_a_grid_opens_with_its_command_which_reads_it(path):
     (command,) = (line for line in opening(path) if line.startswith("uv run unimask paper "))
     arguments = make_parser().parse_args(shlex.split(command)[3:])
     assert arguments.config_path == path

@@ -56,7 +56,7 @@ def recorded(value: object) -> set[float]:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, str]:
+def small(tmp_path_factory):
     """A demo of four updates and a few episodes: its folder, its record and what it printed itself."""
     output = tmp_path_factory.mktemp("demo") / "unimask-demo"
     printed = io.StringIO()
@@ -68,7 +68,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, str]:
     return output, record, printed.getvalue()
 
 
-def test_a_small_demo_leaves_everything(small: tuple[Path, dict, str]) -> None:
+def test_a_small_demo_leaves_everything(small):
     output, record, printed = small
     assert check_files(output) == json.loads(json.dumps(record))
     assert record["updates"] == 4
@@ -76,7 +76,7 @@ def test_a_small_demo_leaves_everything(small: tuple[Path, dict, str]) -> None:
     assert f"everything is in {output}" in printed
 
 
-def test_every_number_that_is_printed_is_recorded(small: tuple[Path, dict, str]) -> None:
+def test_every_number_that_is_printed_is_recorded(small):
     output, record, printed = small
     printed = printed.partition("What to try next:")[0]
     results = [line.replace(str(output), "") for line in printed.splitlines() if re.match(r" {2,}\S", line)]
@@ -89,7 +89,7 @@ def test_every_number_that_is_printed_is_recorded(small: tuple[Path, dict, str])
     assert len(results) > len(QUESTIONS) + len(TASKS) + 2 * len(record["panels"])
 
 
-def test_the_commands_to_try_next_name_what_is_there(small: tuple[Path, dict, str]) -> None:
+def test_the_commands_to_try_next_name_what_is_there(small):
     output, _, printed = small
     _, _, advice = printed.partition("What to try next:")
     assert [word for word in ("lerobot-eval", "lerobot-train", "unimask validate") if word not in advice] == []
@@ -99,7 +99,7 @@ def test_the_commands_to_try_next_name_what_is_there(small: tuple[Path, dict, st
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
-def test_a_place_that_is_taken_is_refused_and_left_as_it_was(tmp_path: Path, kind: str, capsys) -> None:
+def test_a_place_that_is_taken_is_refused_and_left_as_it_was(tmp_path, kind, capsys):
     taken = tmp_path / "thesis.txt"
     taken.write_text("three years of work")
     with pytest.raises(FileExistsError, match="--output=DIR"):
@@ -109,7 +109,7 @@ def test_a_place_that_is_taken_is_refused_and_left_as_it_was(tmp_path: Path, kin
     assert capsys.readouterr().out == ""
 
 
-def test_a_command_that_fails_ends_the_demo_and_its_log_says_why(tmp_path: Path) -> None:
+def test_a_command_that_fails_ends_the_demo_and_its_log_says_why(tmp_path):
     log = tmp_path / "eval.log"
     with pytest.raises(ChildProcessError, match=rf"lerobot-eval failed, with status \d+; {log}"):
         demo._run(log, "lerobot-eval", "--policy.path=nowhere", "--env.type=doorkey")
@@ -135,7 +135,7 @@ def most_memory(process: subprocess.Popen) -> int:
 
 
 @pytest.mark.slow
-def test_the_full_demo_is_quick_and_small_and_answers_well(tmp_path: Path) -> None:
+def test_the_full_demo_is_quick_and_small_and_answers_well(tmp_path):
     script = Path(sys.executable).with_name("unimask")
     began = time.monotonic()
     with (tmp_path / "log").open("w") as log:

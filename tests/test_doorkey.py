@@ -134,16 +134,6 @@ def test_expert_is_that_of_the_text(reading):
         )
 
 
-def test_the_two_readings_differ_where_the_text_says():
-    bump = cell_at(2, 1), cell_at(1, 4), False  # right of it the locked door, above it the outer wall
-    paper, released = (expert_probabilities(*bump, expert=reading) for reading in ("paper", "released"))
-    np.testing.assert_allclose(np.log(paper[RIGHT] / paper[DOWN]), -1)  # stays: 0 against 1
-    np.testing.assert_allclose(np.log(released[RIGHT] / released[DOWN]), -2)  # further: -1 against 1
-    # The target stays the goal in the left room, once the door is open; right is the wall.
-    back = cell_at(2, 2), cell_at(2, 2), True
-    np.testing.assert_allclose(expert_probabilities(*back), np.exp([0, 1, -1, -1]) / np.exp([0, 1, -1, -1]).sum())
-
-
 def test_beta_is_the_experts_rationality():
     start = (cell_at(1, 1), cell_at(2, 2), False)
     np.testing.assert_allclose(expert_probabilities(*start, beta=0), 1 / 4)

@@ -6,7 +6,6 @@ import itertools
 import json
 import subprocess
 import sys
-from argparse import Action
 
 import pytest
 from draccus.argparsing import ArgumentParser
@@ -27,7 +26,7 @@ TEXTS = {
 
 
 @pytest.fixture(scope="module")
-def flags() -> dict[str, Action]:
+def flags():
     """lerobot-train's flags, as its own parser has them once it has imported its policies, and plugins after these."""
     policies = PreTrainedConfig._choice_registry
     policies["unimask"] = policies.pop("unimask")

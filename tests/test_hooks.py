@@ -203,7 +203,7 @@ def test_columns_that_cannot_be_states_are_refused(tiny_policy, states):
         tiny_policy("gaussian", features=COLUMNS, stats=CONTINUOUS_STATS, states=states)
 
 
-def test_lerobots_page_about_ffmpeg_is_one_line_said_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_lerobots_page_about_ffmpeg_is_one_line_said_once(caplog):
     caplog.set_level(logging.WARNING, logger="lerobot.utils.import_utils")
     for _ in range(2):
         logging.getLogger("lerobot.utils.import_utils").warning(

@@ -20,7 +20,7 @@ from lerobot_unimask.configuration_unimask import FORMAT_VERSION
 FLOW = Path(__file__).with_name("hub_flow.py")
 
 
-def test_everything_by_way_of_a_hub() -> None:
+def test_everything_by_way_of_a_hub():
     """The tests of hub_flow.py and hub_refusals.py, whose huggingface_hub is imported for the loopback server."""
     flags = ["-q", "--show-capture=no", "-p", "no:cacheprovider", "-p", "no:randomly", "--noconftest"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "PYTEST_"))}
@@ -36,7 +36,7 @@ def test_everything_by_way_of_a_hub() -> None:
 
 
 @pytest.mark.slow
-def test_the_console_scripts_with_a_hub_and_then_without(tmp_path: Path) -> None:
+def test_the_console_scripts_with_a_hub_and_then_without(tmp_path):
     """Each command a process of its own, as a user runs it; in the end HF_HUB_OFFLINE=1, and no server at all."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("HF_")}
     environment |= {"HF_HOME": str(tmp_path / "home"), "HF_HUB_DISABLE_XET": "1", "OMP_NUM_THREADS": "1"}
@@ -69,7 +69,7 @@ def test_the_console_scripts_with_a_hub_and_then_without(tmp_path: Path) -> None
 
 
 @pytest.fixture
-def checkpoint(tiny_policy, tmp_path: Path) -> Path:
+def checkpoint(tiny_policy, tmp_path):
     tiny_policy().save_pretrained(tmp_path / "checkpoint")
     return tmp_path / "checkpoint"
 
@@ -114,9 +114,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("settings", "words"), WRONG.values(), ids=WRONG)
-def test_a_wrong_config_ends_in_one_error(
-    checkpoint: Path, settings: dict, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_wrong_config_ends_in_one_error(checkpoint, settings, words, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     change(checkpoint, **settings)
     with pytest.raises(ValueError, match=r"config.json cannot be read: ") as error:
@@ -125,13 +123,8 @@ def test_a_wrong_config_ends_in_one_error(
     assert not (tmp_path / "ran").exists()
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["an unknown field", "a wrong type", "width of 1000000000", "a mask that does not parse", "a newer format"],
-)
-def test_lerobot_eval_refuses_it_too(
-    checkpoint: Path, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("name", ["an unknown field", "a mask that does not parse"])
+def test_lerobot_eval_refuses_it_too(checkpoint, name, monkeypatch, tmp_path, capsys):
     from lerobot.scripts import lerobot_eval
 
     settings, words = WRONG[name]
@@ -150,9 +143,7 @@ def test_lerobot_eval_refuses_it_too(
 @pytest.mark.parametrize(
     "sizes", [{"width": 65536}, {"depth": 512}, {"feedforward_width": 262144}, {"width": 65536, "depth": 100}]
 )
-def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_allocated(
-    checkpoint: Path, sizes: dict, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_allocated(checkpoint, sizes, monkeypatch):
     change(checkpoint, **sizes)
     monkeypatch.setattr(UniMASKPolicy, "__init__", None)  # is not even begun
     began = time.process_time()
@@ -161,17 +152,12 @@ def test_sizes_that_the_weights_do_not_have_are_refused_before_anything_is_alloc
     assert time.process_time() - began < 5
 
 
-def test_a_config_that_is_no_json_ends_in_one_error(checkpoint: Path) -> None:
+def test_a_config_that_is_no_json_ends_in_one_error(checkpoint):
     (checkpoint / "config.json").write_text('{"type": "unimask",')
     with pytest.raises(ValueError, match=r"config.json cannot be read"):
         UniMASKPolicy.from_pretrained(checkpoint)
 
 
-def test_a_folder_without_a_checkpoint_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="neither a checkpoint"):
-        UniMASKPolicy.from_pretrained(tmp_path)
-
-
-def test_a_saved_config_has_the_format(checkpoint: Path) -> None:
+def test_a_saved_config_has_the_format(checkpoint):
     assert json.loads((checkpoint / "config.json").read_text())["format_version"] == FORMAT_VERSION
     assert UniMASKPolicy.from_pretrained(checkpoint).config.format_version == FORMAT_VERSION

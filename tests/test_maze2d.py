@@ -134,15 +134,6 @@ def test_gymnasium_accepts_the_environment():
     check_env(Maze2DEnv(), skip_render_check=True)
 
 
-def test_velocity_is_hidden_and_matters():
-    slow, fast = Maze2DEnv(), Maze2DEnv()
-    options = {"position": (3, 3), "goal": (6, 6)}
-    observation, _ = slow.reset(options={**options, "velocity": (0, 0)})
-    other, _ = fast.reset(options={**options, "velocity": (2, 0)})
-    np.testing.assert_array_equal(observation["agent_pos"], other["agent_pos"])
-    assert fast.step(REST)[0]["agent_pos"][0] - slow.step(REST)[0]["agent_pos"][0] == pytest.approx(0.02, rel=0.01)
-
-
 def test_rewards_telescope_and_episodes_are_truncated_at_the_horizon():
     env = Maze2DEnv()
     observation, _ = env.reset(seed=3)
@@ -252,15 +243,19 @@ def test_a_custom_maze_works_in_either_notation():
     )
 
 
-@pytest.mark.parametrize("goal", [(0, 0), (1, 3), (-1, 1), (8, 1), (1.5, 1), (math.nan, 1), (1,), "ab"])
-def test_goals_in_walls_or_outside_are_refused(goal):
-    with pytest.raises(ValueError):  # noqa: PT011 (three messages, one per kind)
+NOT_FREE = r"is not a free cell.*\n########\n#OO##OO#"
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        *((goal, NOT_FREE) for goal in ((0, 0), (1, 3), (-1, 1), (8, 1), (1.5, 1))),
+        *((goal, "goal must be|could not convert") for goal in ((math.nan, 1), (1,), "ab")),
+    ],
+)
+def test_goals_in_walls_or_outside_are_refused(goal, message):
+    with pytest.raises(ValueError, match=message):
         Maze2DEnv().reset(options={"goal": goal})
-
-
-def test_the_error_for_a_goal_in_a_wall_shows_the_maze():
-    with pytest.raises(ValueError, match=r"goal \(1, 3\) is not a free cell.*\n########\n#OO##OO#"):
-        Maze2DEnv().reset(options={"goal": (1, 3)})
 
 
 @pytest.mark.parametrize("position", [(0, 0), (3, 0.9), (20, 3), (math.inf, 3)])

@@ -122,6 +122,7 @@ def on_gpu(tiny_policy, batch_of):
     torch.__future__.set_overwrite_module_params_on_conversion(overwrites)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_on_a_gpu_a_loss_is_one_graph_of_that_gpus_tensors(on_gpu, capture):
     graphs = capture("eager")

@@ -145,7 +145,7 @@ def test_marginals_equal_enumeration(monkeypatch, expert, horizon, first, K):
             np.testing.assert_allclose(part[b].exp().numpy(), expected[name], atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("expert", EXPERTS)
+@pytest.mark.parametrize("expert", [EXPERTS[0], pytest.param(EXPERTS[1], marks=pytest.mark.slow)])
 def test_marginals_equal_the_shares_of_many_episodes(expert):
     """Each frequency within five of its standard errors (with some room for small counts), for twenty masks."""
     episodes = Episodes(*(c.astype(np.int8) for c in rollout(1_000_000, np.random.default_rng(0), expert=expert)))
@@ -167,7 +167,7 @@ def test_marginals_equal_the_shares_of_many_episodes(expert):
 
 
 @pytest.fixture(scope="module")
-def recorded() -> Window:
+def recorded():
     """Sixty windows of the paper's expert."""
     episodes = rollout(60, np.random.default_rng(3))
     states = np.stack([episodes.agent, episodes.key], axis=-1)[:, :10]

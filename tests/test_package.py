@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(tmp_path_factory):
     """A folder that holds the installed wheel and nothing else."""
     uv = os.environ.get("UV") or shutil.which("uv")
     assert uv, "run the tests with `uv run pytest`"
@@ -36,14 +36,14 @@ def run_outside(code: str, installed: Path, cwd: Path) -> str:
     return done.stdout
 
 
-def test_the_wheel_holds_the_three_packages_and_no_more(installed: Path) -> None:
+def test_the_wheel_holds_the_three_packages_and_no_more(installed):
     packages = {path.parent.relative_to(installed).parts[0] for path in installed.rglob("*.py")}
     assert packages == {"lerobot_unimask", "lerobot_policy_unimask", "dataset_builders"}
     policies = {path.parent.name for path in installed.glob("lerobot_unimask/pretrained/*/model.safetensors")}
     assert policies == {"doorkey", "maze2d"}
 
 
-def test_lerobot_discovers_the_wheel_and_makes_policy_and_environment_by_name(installed: Path, tmp_path: Path) -> None:
+def test_lerobot_discovers_the_wheel_and_makes_policy_and_environment_by_name(installed, tmp_path):
     code = """
 import sys
 from lerobot.utils.import_utils import register_third_party_plugins

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 from lerobot.configs import FeatureType
-from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
+from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from policies import CONTINUOUS_STATS, assert_same_answers, assert_unchanged, without_return
@@ -14,13 +14,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from lerobot_unimask import MaskError, UniMASKPolicy
-
-
-def test_policy_and_config_are_found_by_name():
-    policy_class, config = get_policy_class("unimask"), make_policy_config("unimask", device="cpu")
-    assert policy_class is UniMASKPolicy
-    assert policy_class.name == config.type == "unimask"
-    assert isinstance(config, policy_class.config_class)
 
 
 def declared_features(features):

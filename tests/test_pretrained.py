@@ -21,10 +21,6 @@ ROOT = Path(__file__).parents[1]
 MOST = 4 * 2**20  # bytes
 
 
-def test_they_are_doorkeys_and_maze2ds():
-    assert list(FOLDERS) == ["doorkey", "maze2d"]
-
-
 @pytest.mark.parametrize(("name", "config"), [("doorkey", "doorkey_20000_both"), ("maze2d", "maze2d_pretrained")])
 def test_a_folder_is_small_and_says_how_it_was_made(name, config):
     assert sum(path.stat().st_size for path in FOLDERS[name].iterdir()) < MOST

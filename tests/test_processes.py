@@ -77,7 +77,7 @@ def recorded_run(launcher: list[str], arguments: list[str], output: Path) -> dic
 
 
 @pytest.mark.slow
-def test_accelerate_launch_trains_the_model_of_one_process_with_twice_the_batch(tmp_path: Path) -> None:
+def test_accelerate_launch_trains_the_model_of_one_process_with_twice_the_batch(tmp_path):
     # 1,000 windows, of which a hundred updates take 800: within the first epoch no batch is short.
     root = build_doorkey(tmp_path / "doorkey", episodes=1000, progress=False)
     train = [*TRAIN_FLAGS, *WITHOUT_DROPOUT]

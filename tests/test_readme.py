@@ -8,7 +8,6 @@ Python. What makes it short is in `SHORT`; nothing else of it is changed. What i
 reason; a trailing comment with the word hours does the same for one line.
 """
 
-import json
 import re
 import shlex
 import shutil
@@ -161,7 +160,7 @@ def name(value: Path | Command | Block) -> str:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Where the README's reader stands: after cloning, with nothing built."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
@@ -169,7 +168,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def namespace() -> dict[str, Any]:
+def namespace():
     """The Python blocks are one session."""
     return {"__name__": "readme"}
 
@@ -179,9 +178,7 @@ def namespace() -> dict[str, Any]:
     [pytest.param(*case, marks=[pytest.mark.slow] * (case[0] == RESULTS)) for case in CASES],
     ids=name,
 )
-def test_what_the_readme_says_works(
-    document: Path, case: Command | Block, folder: Path, namespace: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_readme_says_works(document, case, folder, namespace, monkeypatch):
     monkeypatch.chdir(folder)
     if isinstance(case, Block):
         padding = "\n" * (case.line - 1)  # so that a traceback names the document's lines
@@ -195,7 +192,7 @@ def test_what_the_readme_says_works(
 @pytest.mark.parametrize(
     "command", [c for _, c in CASES if isinstance(c, Command) and c.words[:3] == ["uv", "run", "unimask"]], ids=name
 )
-def test_unimask_understands_its_commands(command: Command) -> None:
+def test_unimask_understands_its_commands(command):
     from lerobot_unimask.cli import make_parser
 
     make_parser().parse_args(command.words[3:])
@@ -241,7 +238,7 @@ def heading_anchors(document: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_and_images_lead_somewhere(document: Path) -> None:
+def test_links_and_images_lead_somewhere(document):
     text = prose(document)
     targets = re.findall(r"\]\(\s*<?([^)\s>]+)", text) + re.findall(r"(?:src|href)=\"([^\"]+)\"", text)
     targets += re.findall(r"^\[[^\]]+\]:\s*(\S+)", text, re.MULTILINE)
@@ -254,39 +251,3 @@ def test_links_and_images_lead_somewhere(document: Path) -> None:
         if not file.exists() or (anchor and file.suffix == ".md" and anchor not in heading_anchors(file)):
             lost.append(target)
     assert lost == []
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_numbers_come_from_records(document: Path) -> None:
-    """A table under `<!-- from: PATH -->` comes from that JSON in this repository."""
-    for path in re.findall(r"<!--\s*from:\s*(\S+?)\s*-->", document.read_text()):
-        assert json.loads((ROOT / path).read_text()), path
-
-
-# --- This file -------------------------------------------------------------------------------------------------------
-
-EXAMPLE = """# Title
-
-```bash
-pip install uv   # once
-uv run unimask build doorkey --episodes=500 \\
-    --root=data/doorkey
-# a comment
-uv run lerobot-train --config_path=configs/doorkey.yaml  # about two hours
-```
-
-```python
-answer = 6 * 7
-```
-"""
-
-
-def test_blocks_and_commands_are_found_with_their_lines() -> None:
-    bash, python = read_blocks(EXAMPLE)
-    assert (bash.language, python.language, python.line, python.text) == ("bash", "python", 12, "answer = 6 * 7\n")
-    install, build, train = read_commands(bash)
-    assert [command.line for command in (install, build, train)] == [4, 5, 8]
-    assert build.words == ["uv", "run", "unimask", "build", "doorkey", "--episodes=500", "--root=data/doorkey"]
-    assert install.reason_not_to_run == "installs"
-    assert build.reason_not_to_run is None
-    assert train.reason_not_to_run == "takes hours"

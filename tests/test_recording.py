@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from policies import TRAIN_FLAGS
 
 from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.data import frames, reads
@@ -18,17 +19,7 @@ from lerobot_unimask.data.episodes import open_dataset, read_windows
 K, LENGTHS = 3, (5, 4)
 CAMERAS = ("observation.images.laptop", "observation.images.phone")
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
-POLICY = (
-    "--policy.type=unimask",
-    "--policy.push_to_hub=false",
-    f"--policy.context_length={K}",
-    "--policy.width=16",
-    "--policy.depth=1",
-    "--policy.heads=2",
-    "--policy.feedforward_width=16",
-    "--policy.device=cpu",
-    "--policy.image_size=[48, 64]",
-)
+POLICY = (*TRAIN_FLAGS, f"--policy.context_length={K}", "--policy.image_size=[48, 64]")
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import scale
 
 
 @pytest.mark.slow
-def test_ten_million_frames_train_like_ten_thousand() -> None:
+def test_ten_million_frames_train_like_ten_thousand():
     result = scale.record(10_000_000)
     print(result)
     large = result["large"]

@@ -19,7 +19,7 @@ SMALL = {"device": "cpu", "attention": "bidirectional", "token_layout": "stacked
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory) -> SearchConfig:
+def config(tmp_path_factory):
     folder = tmp_path_factory.mktemp("search")
     return SearchConfig(
         variants={"past": {"training_masks": "past"}, "future": {"training_masks": "future"}},
@@ -41,7 +41,7 @@ def config(tmp_path_factory) -> SearchConfig:
 
 
 @pytest.fixture(scope="module")
-def record(config) -> dict:
+def record(config):
     return search(config)
 
 
@@ -123,6 +123,7 @@ def test_dotted_names_lead_into_mappings():
     assert nested({"width": 8, "loss_weights.s": 0.5}) == {"width": 8, "loss_weights": {"s": 0.5}}
 
 
+@pytest.mark.slow
 def test_the_quick_form(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cli.main(["paper", "search", f"--config_path={CONFIGS / 'search_quick.yaml'}"])
