@@ -32,6 +32,7 @@ def files(folder: Path) -> dict[str, bytes]:
         (["build", "doorkey", "--root=d", "--episodes=few"], "'few' is not a whole number of at least 1"),
         (["build", "doorkey", "--root=d", "--expert=best"], "choose from"),
         (["build", "doorkey", "--root=d", "--seed=-1"], "seed at least 0"),
+        (["build", "doorkey", "--root=d", "--use_videos=false"], "there are none without --camera=true"),
         (["demo", "--ouput=d"], "Did you mean --output?"),
         (["validate", "--dataset.root=d"], "required: --policy.path"),
         (["validate", "--policy.path=r"], "Which dataset?"),

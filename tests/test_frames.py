@@ -1,13 +1,18 @@
 """Cached frames equal what LeRobot decodes, are complete or not there, and are continued after an interruption."""
 
 import errno
+import io
+import json
 import os
 import shutil
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from PIL import Image
 from torch.utils.data import default_collate
 
 from lerobot_unimask.data import frames, reads
@@ -52,6 +57,28 @@ def test_equal_to_what_lerobot_reads(recorded, size, episodes, tmp_path):
     assert cached.dtype == np.uint8
     assert cached.shape == expected.shape
     assert np.abs(cached.astype(int) - expected).max() <= 1
+
+
+def test_grey_pictures_have_the_channels_that_lerobot_reads(recorded, tmp_path):
+    """A video whose description says one channel is read with three; stored pictures of one channel with one."""
+    root = shutil.copytree(recorded, tmp_path / "grey")
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][KEY]["shape"] = [SIDE, SIDE, 1]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    for path in (root / "data").rglob("*.parquet"):
+        table = pq.read_table(path)
+        if KEY in table.column_names:
+            pictures = [grey_png(cell["bytes"]) for cell in table[KEY].to_pylist()]
+            column = pa.array(pictures, type=table.schema.field(KEY).type)
+            pq.write_table(table.set_column(table.column_names.index(KEY), table.schema.field(KEY), column), path)
+    dataset = opened(root)
+    assert np.array_equal(frames.cached_frames(dataset, KEY, (SIDE, SIDE), tmp_path / "cache"), read(dataset).numpy())
+
+
+def grey_png(data):
+    file = io.BytesIO()
+    Image.open(io.BytesIO(data)).convert("L").save(file, "PNG")
+    return {"bytes": file.getvalue(), "path": None}
 
 
 def test_decoded_once_and_again_for_another_content(recorded, tmp_path, monkeypatch):

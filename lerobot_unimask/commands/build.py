@@ -63,6 +63,8 @@ def _camera(parser: argparse.ArgumentParser) -> None:
 def _build(arguments: argparse.Namespace) -> None:
     if arguments.push_to_hub and not arguments.repo_id:  # before the work is done
         raise ValueError("--push_to_hub=true needs the repository's name: --repo_id=ME/NAME.")
+    if not getattr(arguments, "use_videos", True) and not arguments.camera:
+        raise ValueError("--use_videos=false says how pictures are stored, and there are none without --camera=true.")
     from dataset_builders.doorkey import build_doorkey
     from dataset_builders.maze2d import build_maze2d
     from dataset_builders.metaworld import build_metaworld

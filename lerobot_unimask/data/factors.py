@@ -358,7 +358,8 @@ def group_features(
 
 
 def colour_cameras(entries: Mapping[str, dict[str, Any]]) -> dict[str, int]:
-    """A dataset's columns of pictures, without those that measure depth -> their number of channels."""
+    """A dataset's columns of pictures, without those that measure depth -> their number of channels, as LeRobot reads
+    them: a video's are three, also of a grey one."""
     found = {}
     for key, entry in entries.items():
         info = {**(entry.get("video_info") or {}), **(entry.get("info") or {})}
@@ -366,7 +367,7 @@ def colour_cameras(entries: Mapping[str, dict[str, Any]]) -> dict[str, int]:
         if entry["dtype"] in ("image", "video") and not depth:
             names = list(entry.get("names") or ["height", "width", "channels"])
             channels = next((axis for axis, name in enumerate(names) if name in ("channel", "channels")), 2)
-            found[key] = entry["shape"][channels]
+            found[key] = 3 if entry["dtype"] == "video" else entry["shape"][channels]
     return found
 
 

@@ -27,6 +27,8 @@ from torch import Tensor
 from torchvision.transforms.v2.functional import resize
 from tqdm import tqdm
 
+from lerobot_unimask.data.factors import colour_cameras
+
 FORMAT = 1  # of the files: another number makes others
 CHUNK = 64  # frames decoded at once, which bounds the memory
 _own = threading.local()  # each thread's decoders: one decoder serves one thread at a time
@@ -62,23 +64,18 @@ def cached_frames(dataset: LeRobotDataset, key: str, size: tuple[int, int], fold
         ValueError: no such camera, one that measures depth, or a frame that does not decode.
         OSError: no room on the disk, before or while it is written; nothing is left that loads.
     """
-    if key not in dataset.meta.camera_keys or key in dataset.meta.depth_keys:
-        colour = [k for k in dataset.meta.camera_keys if k not in dataset.meta.depth_keys]
-        raise ValueError(f"{key!r} is no colour camera of this dataset; its colour cameras are {colour}.")
+    channels = colour_cameras(dataset.meta.features)
+    if key not in channels:
+        raise ValueError(f"{key!r} is no colour camera of this dataset; its colour cameras are {list(channels)}.")
     folder = folder or frames_folder()
     folder.mkdir(parents=True, exist_ok=True)
-    shape = (len(dataset.hf_dataset), dataset.meta.features[key]["shape"][_channel_axis(dataset, key)], *size)
+    shape = (len(dataset.hf_dataset), channels[key], *size)
     path = folder / f"{_fingerprint(dataset, key, shape)}.frames"
     if not path.exists():
         with FileLock(path.with_suffix(".lock")):
             if not path.exists():  # somebody else may have made it while this process waited
                 _build(dataset, key, shape, path)
     return np.memmap(path, np.uint8, "r", shape=shape)
-
-
-def _channel_axis(dataset: LeRobotDataset, key: str) -> int:
-    names = dataset.meta.features[key].get("names") or ["height", "width", "channels"]
-    return next((axis for axis, name in enumerate(names) if name in ("channel", "channels")), 2)
 
 
 def _fingerprint(dataset: LeRobotDataset, key: str, shape: tuple[int, ...]) -> str:
