@@ -1,4 +1,4 @@
-"""Rollouts on MetaWorld's arm, as `tests/arm_tasks.py` and `tests/arm_others.py` measure them."""
+"""Rollouts on MetaWorld's arm, as `tests/measuring/arm_tasks.py` and `tests/measuring/arm_others.py` measure them."""
 
 import time
 from typing import Any

@@ -1,7 +1,7 @@
 """Four questions of one policy of MetaWorld's arm, none of which it was trained for: the picture in docs/arm.md.
 
     uv run unimask build metaworld --task=peg-insert-side-v3 --episodes=12 --seed=1 --root=data/unseen
-    uv run python tests/arm_questions.py --policy=outputs/peg --root=data/peg --unseen=data/unseen \
+    uv run python tests/measuring/arm_questions.py --policy=outputs/peg --root=data/peg --unseen=data/unseen \
         --output=docs/arm_questions.png
 """
 

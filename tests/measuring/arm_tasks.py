@@ -1,7 +1,7 @@
 """The default policy on tasks of MetaWorld's arm, one for each task or one for all, beside a perceptron; windows and
 memories of several lengths.
 
-    OMP_NUM_THREADS=1 uv run python tests/arm_tasks.py --roots=data/peg,data/hammer --seeds=0,1 \
+    OMP_NUM_THREADS=1 uv run python tests/measuring/arm_tasks.py --roots=data/peg,data/hammer --seeds=0,1 \
         --output=docs/results/FILE.json
 
 Trained as lerobot-train does, then rolled out from unseen starts, the same for every model and seed. Each run stands in

@@ -1,11 +1,11 @@
 """LeRobot's own policies on a task of MetaWorld's arm: trained for so many processor seconds, then rolled out.
 
-    OMP_NUM_THREADS=1 uv run python tests/arm_others.py --root=data/peg --policy=act --seconds=130 \
+    OMP_NUM_THREADS=1 uv run python tests/measuring/arm_others.py --root=data/peg --policy=act --seconds=130 \
         --settings='{"dim_model": 128}' --output=docs/results/FILE.json
 
 Each call adds a run to the record; a policy has a process of its own, for memory is that process's at its most. Their
 processors, optimiser and data are LeRobot's; the learning rate does not follow a schedule, for how many updates there
-will be is not known. `diffusion` needs LeRobot's extra of that name. Episodes start as in `tests/arm.py`.
+will be is not known. `diffusion` needs LeRobot's extra of that name. Episodes start as in `tests/measuring/arm.py`.
 """
 
 import argparse

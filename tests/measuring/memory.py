@@ -1,6 +1,6 @@
 """How much acting should remember in an environment: rollouts of one checkpoint by `n_obs_steps`.
 
-OMP_NUM_THREADS=1 uv run python tests/memory.py --policy=RUN --env=maze2d --output=docs/results/FILE.json
+OMP_NUM_THREADS=1 uv run python tests/measuring/memory.py --policy=RUN --env=maze2d --output=docs/results/FILE.json
 """
 
 import argparse

@@ -1,7 +1,6 @@
 """The least that a user would expect of MetaWorld's arm: a perceptron, squared error, one observation to one action.
 
-Two hidden layers of 256, Adam, 128 frames an update, a rate that falls to 0 along a cosine. `tests/arm_tasks.py` runs
-it.
+Two hidden layers of 256, Adam, 128 frames an update, a rate that falls to 0 along a cosine. `arm_tasks.py` runs it.
 """
 
 import time
