@@ -10,6 +10,8 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,14 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import dataset_metadata, factory, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import configs
 from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
 from lerobot_unimask.data.episodes import check_format, check_home
 from lerobot_unimask.data.taking_over import keep_to
+from lerobot_unimask.envs.metaworld.environment import load_metaworld
 from lerobot_unimask.sharing import hub
 
 logger = logging.getLogger(__name__)
@@ -41,6 +45,7 @@ def apply() -> None:
     _work_offline()
     _record_integers()
     _say_in_a_line_what_decodes()
+    _start_metaworld()
 
 
 def _read_windows_in_batches() -> None:
@@ -185,6 +190,24 @@ def _record_integers() -> None:
         return frame
 
     lerobot_eval._build_raw_frame = build_declared
+
+
+def _start_metaworld() -> None:
+    """LeRobot's own `--env.type=metaworld` ends in an error of numpy's where MuJoCo is 4 or later (`load_metaworld`).
+    Its workers import no plugin, so that all environments run in one process there.
+
+    Other policies: the same; with MuJoCo 3 nothing changes.
+    """
+    create = configs.MetaworldEnv.create_envs
+
+    @functools.wraps(create)
+    def create_mended(self: configs.MetaworldEnv, n_envs: int, use_async_envs: bool = False) -> Any:
+        if find_spec("mujoco") and int(version("mujoco").split(".")[0]) > 3:
+            load_metaworld()
+            use_async_envs = False
+        return create(self, n_envs, use_async_envs)
+
+    configs.MetaworldEnv.create_envs = create_mended
 
 
 def make_known_to_policy_server() -> None:

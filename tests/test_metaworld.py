@@ -108,6 +108,16 @@ def test_lerobot_makes_the_environment_of_a_task():
     envs.close()
 
 
+def test_lerobots_own_environment_starts():
+    """Also with MuJoCo 4. Nothing is drawn, for which there may be no display."""
+    (envs,) = make_env(make_env_config("metaworld", task="reach-v3"), n_envs=2, use_async_envs=True)[
+        "reach-v3"
+    ].values()
+    for arm in envs.envs:
+        arm.unwrapped._ensure_env()
+        assert np.isfinite(arm.unwrapped._env.reset(seed=0)[0]).all()
+
+
 def test_an_unknown_task_is_named_beside_those_there_are():
     with pytest.raises(ValueError, match="reach-v4") as raised:
         MetaWorldEnv("reach-v4")
