@@ -27,11 +27,17 @@ from tqdm import tqdm
 from dataset_builders.folders import refuse_existing, written_whole
 from dataset_builders.writer import (
     PROVENANCE_PATH,
+    EpisodeStatistics,
+    as_cells,
     dataset_statistics,
     episode_statistics,
     provenance_of_now,
+    statistics_columns,
 )
+from lerobot_unimask.data.episodes import check_folder, check_format, read_info
+from lerobot_unimask.data.factors import is_numeric
 from lerobot_unimask.data.returns import return_to_go
+from lerobot_unimask.data.soundness import data_files, innermost
 from lerobot_unimask.sharing.hub import commit_of
 
 Episode = dict[str, np.ndarray]  # a dataset's columns of numbers: (T,) where D = 1, else (T, D)
@@ -60,7 +66,7 @@ def visits(root: Path, condition: str) -> Labeller:
     Raises:
         ValueError: the state has no such component or category.
     """
-    features = _read_info(root)["features"]
+    features = read_info(root)["features"]
     known = {}  # component -> (column, which of its numbers, how many categories)
     for key in ("observation.state", "observation.environment_state"):
         entry = features.get(key, {})
@@ -134,7 +140,8 @@ def add_label(
             `root` is what the Hub's client keeps of a commit.
     """
     root = Path(root).expanduser().resolve()
-    _read_info(root)
+    check_folder(root)
+    check_format(root)
     if not re.fullmatch(r"observation\.[\w.]+", name):
         raise ValueError(f"name is {name!r}; a label is named observation.NAME, or LeRobot reads no windows of it.")
     if output is None and (commit := commit_of(root)):
@@ -143,7 +150,7 @@ def add_label(
     if root in target.parents:
         raise ValueError(f"output is {target}, a folder inside the dataset itself; choose one beside it.")
     with written_whole(target, replacing=output is None) as new:
-        info = _read_info(root)  # now that nobody else adds a label
+        info = read_info(root)  # now that nobody else adds a label
         if name in info["features"]:
             raise ValueError(f"{root} has a column {name} already; choose another name.")
         column, lengths = _label_all(root, info, labeller, progress)
@@ -157,31 +164,17 @@ def add_label(
     return target
 
 
-def _read_info(root: Path) -> dict[str, Any]:
-    path = root / "meta" / "info.json"
-    if not path.exists():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset: there is no meta/info.json in it.")
-    info = json.loads(path.read_text())
-    if not info.get("codebase_version", "").startswith("v3"):
-        raise ValueError(f"{root} is in LeRobot's format {info.get('codebase_version')}; only v3.0 can be labelled.")
-    return info
-
-
-def data_files(root: Path) -> list[Path]:
-    """In the order in which LeRobot reads them."""
-    return sorted((root / "data").glob("*/*.parquet"))
-
-
 def _label_all(
     root: Path, info: Mapping[str, Any], labeller: Labeller, progress: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """The labels of all frames, (N, D), and the episodes' lengths, (E,)."""
-    no_numbers = ("image", "video", "string", "language")
-    features = {key: entry for key, entry in info["features"].items() if entry["dtype"] not in no_numbers}
-    numbers = [key for key, entry in features.items() if len(entry["shape"]) == 1]
-    tables = [pq.read_table(path, columns=numbers) for path in data_files(root)]
-    table = pa.concat_tables(tables)
-    columns = {key: _as_array(table.column(key), info["features"][key]["shape"][0]) for key in numbers}
+    features = info["features"]
+    keys = [key for key, entry in features.items() if is_numeric(entry) and entry["shape"]]
+    table = pa.concat_tables([pq.read_table(path, columns=keys) for path in data_files(root)])
+    columns = {}  # (N,), or (N, D) where a row is a list
+    for key in keys:
+        flat, size = flat_numbers(table.column(key)), features[key]["shape"][0]
+        columns[key] = flat.reshape(-1, size) if pa.types.is_nested(table.schema.field(key).type) else flat
     starts = np.flatnonzero(np.diff(columns["episode_index"], prepend=-1))
     lengths = np.diff(starts, append=len(table))
     parts = []
@@ -199,14 +192,11 @@ def _label_all(
     return np.concatenate(parts), lengths
 
 
-def _as_array(column: pa.ChunkedArray, size: int) -> np.ndarray:
-    """(N,) where size = 1, else (N, size)."""
+def flat_numbers(column: pa.ChunkedArray) -> np.ndarray:
+    """The numbers of a column, one row's after another's."""
     array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays(array.chunks)
-    if size == 1 and not pa.types.is_nested(array.type):
-        return array.to_numpy(zero_copy_only=False)
-    return array.flatten().to_numpy(zero_copy_only=False).reshape(-1, size)
+    array = pa.concat_arrays(array.chunks) if isinstance(array, pa.ChunkedArray) else array
+    return innermost(array).to_numpy(zero_copy_only=False)
 
 
 def _rows_of(labeller: Labeller, episode: Episode, number: int, length: int) -> np.ndarray:
@@ -279,35 +269,39 @@ def episode_files(root: Path) -> list[Path]:
     return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
 
 
+def stored_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
+    """The schema of a dataset's tables, from its info.json's features."""
+    tuples = {key: {**entry, "shape": tuple(entry["shape"])} for key, entry in features.items()}
+    return get_hf_features_from_features(tuples).arrow_schema
+
+
 def _write_data(root: Path, partial: Path, info: Mapping[str, Any], name: str, column: np.ndarray) -> None:
-    features = {key: {**entry, "shape": tuple(entry["shape"])} for key, entry in info["features"].items()}
-    schema = get_hf_features_from_features(features).arrow_schema
+    schema = stored_schema(info["features"])
     field, row = schema.field(name), 0
 
     def with_label(table: pa.Table) -> pa.Table:
         nonlocal row
         part = column[row : row + len(table)]
         row += len(table)
-        flat = pa.array(part.ravel())
-        array = flat if part.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, part.shape[1])
-        return table.append_column(field, array.cast(field.type)).replace_schema_metadata(schema.metadata)
+        return table.append_column(field, as_cells(part, field.type)).replace_schema_metadata(schema.metadata)
 
     for path in data_files(root):
         rewrite(path, partial / path.relative_to(root), with_label)
 
 
-def _write_episodes(root: Path, partial: Path, name: str, statistics: Mapping[str, np.ndarray]) -> None:
-    def with_statistics(table: pa.Table) -> pa.Table:
-        rows = table.column("episode_index").to_numpy()
-        for statistic, values in statistics.items():  # (E, D)
-            chosen = values[rows] if statistic == "count" else values[rows].astype(np.float64)
-            offsets = np.arange(len(rows) + 1, dtype=np.int32) * chosen.shape[1]
-            array = pa.ListArray.from_arrays(offsets, pa.array(chosen.ravel()))
-            table = table.append_column(f"stats/{name}/{statistic}", array)
-        return table
-
+def _write_episodes(root: Path, partial: Path, name: str, statistics: EpisodeStatistics) -> None:
     for path in episode_files(root):
-        rewrite(path, partial / path.relative_to(root), with_statistics)
+        rewrite(path, partial / path.relative_to(root), lambda table: with_statistics(table, {name: statistics}))
+
+
+def with_statistics(table: pa.Table, found: Mapping[str, EpisodeStatistics]) -> pa.Table:
+    """The episodes' metadata with the statistics of more columns."""
+    rows = table.column("episode_index").to_numpy()
+    for name, statistics in found.items():
+        chosen = {statistic: values[rows] for statistic, values in statistics.items()}
+        for column, cells in statistics_columns(name, chosen).items():
+            table = table.append_column(column, cells)
+    return table
 
 
 def rewrite(source: Path, target: Path, change: Callable[[pa.Table], pa.Table]) -> None:

@@ -16,15 +16,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from dataset_builders.folders import refuse_existing, written_whole
-from dataset_builders.label import copy_rest, data_files, episode_files, rewrite
-from dataset_builders.writer import dataset_statistics, episode_statistics
+from dataset_builders.label import copy_rest, episode_files, flat_numbers, rewrite, stored_schema, with_statistics
+from dataset_builders.writer import EpisodeStatistics, as_cells, dataset_statistics, episode_statistics
 from lerobot_unimask.data.episodes import check_folder
 from lerobot_unimask.data.factors import TEXTS, flat_names
-from lerobot_unimask.data.soundness import check_columns, check_statistics
+from lerobot_unimask.data.soundness import check_columns, check_statistics, data_files
 from lerobot_unimask.records import read_json, write_json
 
 PICTURES = ("image", "video")
@@ -215,11 +214,10 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
     old_features = {key: entry for key, entry in info["features"].items() if key not in plan.drop}
     columns = _read_numbers(source, old_features, plan)
     features = {plan.rename.get(old, old): _entry(old, entry, plan, columns) for old, entry in old_features.items()}
-    schema = get_hf_features_from_features({k: {**e, "shape": tuple(e["shape"])} for k, e in features.items()})
+    stored = stored_schema(features)
     new_names = {old: plan.rename.get(old, old) for old in old_features}
 
     def with_columns(table: pa.Table) -> pa.Table:
-        stored = schema.arrow_schema
         arrays = {new: table.column(old) for old, new in new_names.items() if old in table.column_names}
         fields = [stored.field(new) for new in arrays]
         cells = [_as_stored(arrays[f.name], f.type, features[f.name]["shape"]) for f in fields]
@@ -252,7 +250,7 @@ def _read_numbers(source: Path, features: Mapping[str, Mapping[str, Any]], plan:
     for old in features:
         new = plan.rename.get(old, old)
         if new in wanted:
-            parts = [_flat(pq.read_table(path, columns=[old]).column(old)) for path in data_files(source)]
+            parts = [flat_numbers(pq.read_table(path, columns=[old]).column(old)) for path in data_files(source)]
             columns[new] = np.concatenate(parts).reshape(sum(_lengths(source)), -1)
     return columns
 
@@ -274,26 +272,16 @@ def _entry(old: str, entry: dict[str, Any], plan: Plan, columns: Mapping[str, np
     return entry
 
 
-def _flat(column: pa.ChunkedArray) -> np.ndarray:
-    array = column.combine_chunks()
-    array = pa.concat_arrays(array.chunks) if isinstance(array, pa.ChunkedArray) else array
-    while pa.types.is_nested(array.type) or isinstance(array, pa.ExtensionArray):
-        array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
-    return array.to_numpy(zero_copy_only=False)
-
-
 def _as_stored(column: pa.ChunkedArray, kind: pa.DataType, shape: Sequence[int]) -> pa.Array | pa.ChunkedArray:
     """A column as its new type stores it: a list of a row's numbers, or the number itself."""
     if column.type == kind:
         return column
     if pa.types.is_struct(column.type):  # pictures
         return column.cast(kind)
-    flat = pa.array(_flat(column))
-    size = int(np.prod(shape))
-    return (flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)).cast(kind)
+    return as_cells(flat_numbers(column).reshape(len(column), int(np.prod(shape))), kind)
 
 
-def _episodes_table(table: pa.Table, plan: Plan, found: Mapping[str, Mapping[str, np.ndarray]]) -> pa.Table:
+def _episodes_table(table: pa.Table, plan: Plan, found: Mapping[str, EpisodeStatistics]) -> pa.Table:
     """The episodes' metadata with columns renamed, dropped, and statistics added."""
     gone = {*plan.drop, *found}
     kept = []
@@ -304,15 +292,7 @@ def _episodes_table(table: pa.Table, plan: Plan, found: Mapping[str, Mapping[str
             continue
         new = f"{kind}/{plan.rename[key]}/{rest.rpartition('/')[2]}" if key in plan.rename else name
         kept.append((new, table.column(name)))
-    result = pa.table([column for _, column in kept], names=[name for name, _ in kept])
-    rows = table.column("episode_index").to_numpy()
-    for key, statistics in found.items():
-        for statistic, values in statistics.items():  # (E, D)
-            chosen = values[rows] if statistic == "count" else values[rows].astype(np.float64)
-            offsets = np.arange(len(rows) + 1, dtype=np.int32) * chosen.shape[1]
-            array = pa.ListArray.from_arrays(offsets, pa.array(chosen.ravel()))
-            result = result.append_column(f"stats/{key}/{statistic}", array)
-    return result
+    return with_statistics(pa.table([column for _, column in kept], names=[name for name, _ in kept]), found)
 
 
 def _lengths(source: Path) -> np.ndarray:

@@ -264,20 +264,30 @@ def _write_all(
     bar.update()
 
 
+def as_cells(column: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """(N, D) as LeRobot stores it, as `kind`: numbers where D = 1, lists of D numbers otherwise."""
+    flat = pa.array(column.ravel())
+    return (flat if column.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, column.shape[1])).cast(kind)
+
+
+def statistics_columns(name: str, statistics: EpisodeStatistics) -> dict[str, pa.Array]:
+    """The columns of meta/episodes that hold a column's statistics."""
+    columns = {}
+    for statistic, values in statistics.items():  # (E, D)
+        values = values if statistic == "count" else values.astype(np.float64)
+        offsets = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
+        columns[f"stats/{name}/{statistic}"] = pa.ListArray.from_arrays(offsets, pa.array(values.ravel()))
+    return columns
+
+
 def _data_table(
     meta: LeRobotDatasetMetadata, columns: dict[str, np.ndarray], stored: Mapping[str, pa.Array]
 ) -> pa.Table:
     """The columns as LeRobot stores them: (N,) where D = 1, lists of D numbers otherwise; `stored` ones as they are."""
     schema = get_hf_features_from_features(meta.features).arrow_schema
-    arrays = []
-    for field in schema:
-        if field.name in stored:
-            arrays.append(stored[field.name])
-            continue
-        column = columns[field.name]
-        flat = pa.array(column.ravel())
-        array = flat if column.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, column.shape[1])
-        arrays.append(array.cast(field.type))
+    arrays = [
+        stored[field.name] if field.name in stored else as_cells(columns[field.name], field.type) for field in schema
+    ]
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -300,10 +310,7 @@ def _episode_columns(
         "dataset_to_index": pa.array(ends),
     }
     for feature, values in statistics.items():
-        for name, value in values.items():  # (E, D)
-            value = value if name == "count" else value.astype(np.float64)
-            offsets = np.arange(len(lengths) + 1, dtype=np.int32) * value.shape[1]
-            columns[f"stats/{feature}/{name}"] = pa.ListArray.from_arrays(offsets, pa.array(value.ravel()))
+        columns |= statistics_columns(feature, values)
     return columns
 
 

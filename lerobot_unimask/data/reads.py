@@ -28,6 +28,7 @@ from torch.utils.data._utils.collate import collate
 
 from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.frames import cached_frames
+from lerobot_unimask.data.soundness import innermost
 
 
 class Item(dict):
@@ -181,15 +182,11 @@ class Columns:
 
 
 def _flat_numbers(array: pa.Array) -> np.ndarray | None:
-    """Numbers or (nested) lists of numbers as a 1-D array, row after row; None if any is null."""
-    while not array.null_count:
-        if isinstance(array, pa.ExtensionArray):
-            array = array.storage
-        elif pa.types.is_nested(array.type):
-            array = array.flatten()
-        else:
-            return array.to_numpy(zero_copy_only=False)  # copies only booleans, which Arrow packs in bits
-    return None
+    """Numbers or (nested) lists of numbers as a 1-D array, row after row; None if one of them is null."""
+    flat = innermost(array)
+    if array.null_count or flat.null_count:
+        return None
+    return flat.to_numpy(zero_copy_only=False)  # copies only booleans, which Arrow packs in bits
 
 
 def _make_column(pieces: list[np.ndarray], ends: np.ndarray, row: torch.Tensor) -> Column:

@@ -19,6 +19,18 @@ from torch import Tensor
 SEEN = HF_LEROBOT_HOME / "unimask" / "sound"  # markers of datasets that have been looked through
 
 
+def data_files(root: Path) -> list[Path]:
+    """A dataset's tables, in the order in which LeRobot reads them."""
+    return sorted((root / "data").glob("*/*.parquet"))
+
+
+def innermost(array: pa.Array) -> pa.Array:
+    """What (nested) lists, or LeRobot's own types, hold, one number after another."""
+    while isinstance(array, pa.ExtensionArray) or pa.types.is_nested(array.type):
+        array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+    return array
+
+
 def check_columns(root: Path, columns: Mapping[str, Sequence[str]], episodes: Sequence[int] | None = None) -> None:
     """Look through a dataset's columns once; one whose files have not changed since is not read again.
 
@@ -30,7 +42,7 @@ def check_columns(root: Path, columns: Mapping[str, Sequence[str]], episodes: Se
     Raises:
         ValueError: a number is not finite; names the column, the number, and its episode and frame.
     """
-    files = sorted((root / "data").glob("*/*.parquet"))
+    files = data_files(root)
     markers = [SEEN / _fingerprint(root, files, columns, part) for part in {None, _in_order(episodes)}]
     if not files or any(marker.exists() for marker in markers):
         return
@@ -72,9 +84,7 @@ def _numbers(
         rows = rows[np.isin(table.column("episode_index").to_numpy(), list(episodes))]
         table = table.take(rows)
     for key in found if len(table) else ():
-        column = table.column(key).combine_chunks()
-        while pa.types.is_nested(column.type):
-            column = column.flatten()
+        column = innermost(table.column(key).combine_chunks())
         if column.null_count:  # NaN, where Arrow would make objects of whole numbers and booleans
             column = column.cast(pa.float64())
         if len(column) % len(table):
@@ -119,8 +129,7 @@ def check_statistics(key: str, names: Sequence[str], known: Mapping[str, ArrayLi
 
 def compute_statistics(root: Path, key: str, episodes: Sequence[int] | None = None) -> dict[str, np.ndarray]:
     """Mean and standard deviation of a column that the dataset's statistics lack, (D,) each, over some episodes."""
-    files = sorted((root / "data").glob("*/*.parquet"))
-    parts = [values for path in files for _, values, _ in _numbers(path, [key], episodes)]
+    parts = [values for path in data_files(root) for _, values, _ in _numbers(path, [key], episodes)]
     if not parts:
         raise ValueError(f"The dataset's statistics lack {key!r}, and it is no column of numbers in {root / 'data'}.")
     values = np.concatenate(parts).astype(np.float64)
