@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -134,18 +134,12 @@ def _build(dataset: LeRobotDataset, key: str, shape: tuple[int, ...], path: Path
 
     with bar, ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for _ in _results(pool, decode_file, list(files.values())):
-                pass
+            list(pool.map(decode_file, files.values()))  # raises what one of them raised
         except BaseException:
             stopped.set()
             raise
     os.replace(partial, path)
     done_path.unlink(missing_ok=True)
-
-
-def _results(pool: ThreadPoolExecutor, function, arguments: list) -> Iterator[None]:
-    for future in [pool.submit(function, argument) for argument in arguments]:
-        yield future.result()
 
 
 def _reserve(path: Path, size: int) -> None:

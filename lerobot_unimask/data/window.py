@@ -74,25 +74,16 @@ def make_window(
         ValueError: a column's shape is not (B, context_length, size), or a camera's not (B, context_length, C, H, W).
     """
     cameras = cameras or {}
+    if partial:
+        batch = _with_missing(batch, features, cameras, context_length)
     values = {}
-    present = [feature.key for columns in features.values() for feature in columns if feature.key in batch]
     for name, columns in features.items():
-        if partial and present:
-            like = batch[present[0]]
-            nothing = like.new_full((len(like), context_length), torch.nan, dtype=torch.float32)
-            filled = {f.key: nothing.unsqueeze(-1).expand(-1, -1, f.size) for f in columns if f.key not in batch}
-            parts = [_column({**batch, **filled}, feature, context_length) for feature in columns]
-        else:
-            parts = [_column(batch, feature, context_length) for feature in columns]
+        parts = [_column(batch, feature, context_length) for feature in columns]
         if name == "rtg":
             parts.append(_timestep(batch, parts[0], fps) / horizon)
         values[name] = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
     first = next(iter(values.values()))
-    for name, camera in cameras.items():
-        if partial and camera.key not in batch:
-            values[name] = first.new_full((1, 1, 1, 1, 1), torch.nan).expand(*first.shape[:2], *camera.shape)
-        else:
-            values[name] = _pictures(batch, camera, context_length)
+    values |= {name: _pictures(batch, camera, context_length) for name, camera in cameras.items()}
     lengths = {name: len(value) for name, value in values.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"The batch's columns are of different length: {lengths}.")
@@ -166,6 +157,21 @@ def task_column(texts: str | Sequence[str], factor: Factor, context_length: int)
         ValueError: a text that is none of the factor's.
     """
     return torch.tensor(category_numbers(texts, factor)).unsqueeze(1).expand(-1, context_length, -1)
+
+
+def _with_missing(
+    batch: Mapping[str, Tensor], features: Mapping[str, Sequence[Feature]], cameras: Mapping[str, Camera], K: int
+) -> Mapping[str, Tensor]:
+    """The batch with NaN for each column that is not there, where one is."""
+    columns = [feature for columns in features.values() for feature in columns]
+    present = [feature.key for feature in columns if feature.key in batch]
+    if not present:
+        return batch
+    like = batch[present[0]]
+    nothing = like.new_full((len(like), K, 1, 1, 1), torch.nan, dtype=torch.float32)
+    missing = {f.key: nothing[..., 0, 0].expand(-1, -1, f.size) for f in columns if f.key not in batch}
+    missing |= {c.key: nothing.expand(-1, -1, *c.shape) for c in cameras.values() if c.key not in batch}
+    return {**batch, **missing}
 
 
 def _column(batch: Mapping[str, Tensor], feature: Feature, K: int) -> Tensor:

@@ -10,7 +10,7 @@ Legend of shapes: B windows, K steps, F factors, R rows (one for each admissible
 import difflib
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -298,23 +298,20 @@ class Mask:
 
     def within(self, valid: Tensor) -> "Mask":
         """The same mask with steps outside the episode, `valid` (B, K) False, neither shown nor asked."""
-        shown = {name: tokens & valid for name, tokens in self.shown.items()}
-        asked = {name: tokens & valid for name, tokens in self.asked.items()}
+        shown, asked = ({name: part[name] & valid for name in part} for part in (self.shown, self.asked))
         return Mask(shown, asked, self.causal)
 
     def repeat(self, times: int) -> "Mask":
         """Each window's mask `times` times, one after another."""
-        shown = {name: tokens.repeat_interleave(times, dim=0) for name, tokens in self.shown.items()}
-        asked = {name: tokens.repeat_interleave(times, dim=0) for name, tokens in self.asked.items()}
-        causal = self.causal if isinstance(self.causal, bool) else self.causal.repeat_interleave(times, dim=0)
-        return Mask(shown, asked, causal)
+        return self._each(lambda tensor: tensor.repeat_interleave(times, dim=0))
 
     def to(self, device: torch.device) -> "Mask":
-        return Mask(
-            {name: tokens.to(device) for name, tokens in self.shown.items()},
-            {name: tokens.to(device) for name, tokens in self.asked.items()},
-            self.causal if isinstance(self.causal, bool) else self.causal.to(device),
-        )
+        return self._each(lambda tensor: tensor.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "Mask":
+        """The mask with each of its tensors changed."""
+        shown, asked = ({name: change(part[name]) for name in part} for part in (self.shown, self.asked))
+        return Mask(shown, asked, self.causal if isinstance(self.causal, bool) else change(self.causal))
 
     def next_tokens(self, cameras: Sequence[str] = ()) -> dict[str, Tensor]:
         """factor -> (B, K) bool: of the asked tokens the one that follows what is shown, where that is every state and

@@ -34,16 +34,11 @@ from lerobot_unimask.plots.style import (
 )
 
 
-def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
-    """One window's mask: a row for each factor, a column for each step; shown, asked for, or neither.
-
-    Args:
-        mask: one of any questions and factors.
-        window: number of the mask's window that is drawn.
-    """
+def mask_diagram(mask: Mask) -> Figure:
+    """The first window's mask: a row for each factor, a column for each step; shown, asked for, or neither."""
     names = list(mask.shown)
-    shown = np.stack([mask.shown[name][window].numpy(force=True) for name in names])  # (F, K)
-    asked = np.stack([mask.asked[name][window].numpy(force=True) for name in names])
+    shown = np.stack([mask.shown[name][0].numpy(force=True) for name in names])  # (F, K)
+    asked = np.stack([mask.asked[name][0].numpy(force=True) for name in names])
     F, K = shown.shape
     figure = Figure(figsize=(min(WIDTH, 1.5 + 0.42 * K), 0.9 + 0.42 * F), layout="constrained")
     axes = figure.subplots()
@@ -69,17 +64,16 @@ def mask_diagram(mask: Mask, *, window: int = 0) -> Figure:
     return figure
 
 
-def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -> Figure:
-    """What a model of any factors says about each component at each step: probabilities, or means and scales; about the
-    return and a property the one distribution, as bars or as a density.
+def marginals(answer: Answer, truth: Window | None = None) -> Figure:
+    """What a model of any factors says about each component at each step of the first window: probabilities, or means
+    and scales; about the return and a property the one distribution, as bars or as a density.
 
     Args:
         answer: one to any question.
         truth: recorded windows, to draw over it.
-        window: number of the answer's window that is drawn.
     """
     rows = [(name, distribution) for name in answer.distributions for distribution in answer[name]]
-    rows = [(name, d) for name, d in rows if answer.mask.asked[name][window].any()]
+    rows = [(name, d) for name, d in rows if answer.mask.asked[name][0].any()]
     rows.sort(key=lambda row: row[0] not in ASKABLE)  # properties, which have no steps, below
     heights = [0.5 + 0.13 * min(d.component.categories or 12, 20) if name in ASKABLE else 1.5 for name, d in rows]
     figure = Figure(figsize=(WIDTH, 0.9 + sum(heights)), layout="constrained")
@@ -89,20 +83,20 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
     for axes, (name, distribution) in zip(grid, rows, strict=True):
         recorded = None
         if truth is not None:
-            recorded = truth.values[name][window, :, distribution.component.dims].numpy(force=True)  # (K, d)
-            recorded = np.where(truth.valid[window].numpy(force=True)[:, None], recorded, np.nan)
-        shown = answer.mask.shown[name][window].numpy(force=True)  # (K,)
+            recorded = truth.values[name][0, :, distribution.component.dims].numpy(force=True)  # (K, d)
+            recorded = np.where(truth.valid[0].numpy(force=True)[:, None], recorded, np.nan)
+        shown = answer.mask.shown[name][0].numpy(force=True)  # (K,)
         axes.set_ylabel(f"{name}: {distribution.name}", fontsize=SMALL + 1)
         axes.tick_params(labelsize=SMALL)
         if name not in ASKABLE:
-            _draw_property(axes, distribution, None if recorded is None else recorded[0, 0], window)
+            _draw_property(axes, distribution, None if recorded is None else recorded[0, 0])
             continue
         axes.set(xlim=(-0.5, K - 0.5), xticks=range(0, K, max(1, K // 20)))
         axes.tick_params(labelbottom=axes is maps[-1])
         if isinstance(distribution, DiscreteDistribution):
-            _draw_heat_map(axes, distribution, recorded, shown, window)
+            _draw_heat_map(axes, distribution, recorded, shown)
         else:
-            _draw_bands(axes, distribution, recorded, shown, window)
+            _draw_bands(axes, distribution, recorded, shown)
     if maps:
         maps[-1].set_xlabel("step")
     if any(isinstance(d, DiscreteDistribution) and name in ASKABLE for name, d in rows):
@@ -116,9 +110,9 @@ def marginals(answer: Answer, truth: Window | None = None, *, window: int = 0) -
     return figure
 
 
-def _draw_property(axes: Axes, distribution: Distribution, recorded: float | None, window: int) -> None:
+def _draw_property(axes: Axes, distribution: Distribution, recorded: float | None) -> None:
     """The distribution of its token: a bar for each category, or the density, of an L2 head its mean alone."""
-    here = distribution.at(torch.tensor([window]), 0)
+    here = distribution.at(torch.tensor([0]), 0)
     if isinstance(here, DiscreteDistribution):
         probabilities = here.probabilities[0, 0].numpy(force=True)
         labels = here.component.labels or range(len(probabilities))
@@ -140,10 +134,10 @@ def _draw_property(axes: Axes, distribution: Distribution, recorded: float | Non
 
 
 def _draw_heat_map(
-    axes: Axes, distribution: DiscreteDistribution, recorded: np.ndarray | None, shown: np.ndarray, window: int
+    axes: Axes, distribution: DiscreteDistribution, recorded: np.ndarray | None, shown: np.ndarray
 ) -> None:
     """Categories upwards, steps to the right; what is neither shown nor asked stays grey."""
-    probabilities = distribution.probabilities[window].numpy(force=True)  # (K, categories)
+    probabilities = distribution.probabilities[0].numpy(force=True)  # (K, categories)
     axes.set_facecolor(HIDDEN["facecolor"])
     axes.imshow(probabilities.T, cmap="Blues", vmin=0, vmax=1, aspect="auto", origin="lower")
     for step in np.flatnonzero(shown):
@@ -156,15 +150,15 @@ def _draw_heat_map(
 
 
 def _draw_bands(
-    axes: Axes, distribution: ContinuousDistribution, recorded: np.ndarray | None, shown: np.ndarray, window: int
+    axes: Axes, distribution: ContinuousDistribution, recorded: np.ndarray | None, shown: np.ndarray
 ) -> None:
     """A line for each dimension, with a band of one scale to each side, in the dataset's units."""
-    mean = distribution.mean[window].numpy(force=True)  # (K, d)
+    mean = distribution.mean[0].numpy(force=True)  # (K, d)
     steps = np.arange(len(mean))
     for i, colour in zip(range(mean.shape[1]), COLOURS * mean.shape[1], strict=False):
         axes.plot(steps, mean[:, i], marker=".", color=colour, linewidth=1.2, label=distribution.component.names[i])
         if distribution.scale is not None:
-            scale = distribution.scale[window, :, i].numpy(force=True)
+            scale = distribution.scale[0, :, i].numpy(force=True)
             axes.fill_between(steps, mean[:, i] - scale, mean[:, i] + scale, color=colour, alpha=0.2, linewidth=0)
         axes.scatter(steps[shown], mean[shown, i], s=45, facecolors="none", edgecolors=PURPLE, linewidths=1.6, zorder=3)
         if recorded is not None:

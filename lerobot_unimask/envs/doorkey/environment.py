@@ -1,19 +1,4 @@
-"""DoorKey, the paper's gridworld: fetch the key, open the door, walk to the goal (section 5.1 and its appendix).
-
-    x  0 1 2 3 4 5
-    y 0 # # # # # #      A  agent and K key start in different cells of the left room, x in {1, 2}
-      1 # . . D . #      D  the door, locked until the agent walks into it with the key
-      2 # . A # . #      G  the goal; reaching it does not end the episode
-      3 # K . # . #
-      4 # . . # G #      actions: right 0, down 1, left 2, up 3
-      5 # # # # # #
-
-The rules come twice, and a test holds them together: as functions of arrays, which broadcast over any number of states
-(`step`, `reward`, `expert_probabilities`), and as `DoorKeyEnv`, which plays them on MiniGrid's own objects.
-
-A cell is numbered 4 (y - 1) + (x - 1). A state is (agent cell, key cell, door open): a carried key is where the agent
-is, and stepping on the key picks it up, so the agent carries it exactly when the two cells are equal.
-"""
+"""DoorKey as a gymnasium environment, played on MiniGrid's own objects; a test holds it to `rules`."""
 
 from typing import Any
 

@@ -232,7 +232,7 @@ def _key_handle(label: str) -> Line2D:
     return Line2D([], [], marker=KEY, linestyle="none", label=label, **style)
 
 
-def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
+def state_distributions(answer: Answer) -> Figure:
     """DoorKey's predicted states, one grid per step (the paper's figure of predicted state distributions).
 
     The agent's cell is a heat map, the key's a key in the corner of each cell where it may lie, the more solid the
@@ -240,14 +240,13 @@ def state_distributions(answer: Answer, *, window: int = 0) -> Figure:
 
     Args:
         answer: one to a question about `s`, with probabilities for every step, as `predicted_states` gives.
-        window: number of the answer's window that is drawn.
 
     Raises:
         ValueError: the answer says nothing about some steps.
     """
     parts = (part for part in answer["s"] if isinstance(part, DiscreteDistribution))
-    agent, key = (part.probabilities[window].numpy(force=True) for part in parts)  # (K, 16) each
-    shown = answer.mask.shown["s"][window].tolist()
+    agent, key = (part.probabilities[0].numpy(force=True) for part in parts)  # (K, 16) each
+    shown = answer.mask.shown["s"][0].tolist()
     silent = np.flatnonzero(np.isnan(agent).any(axis=1)).tolist()
     if silent:
         neither = ", ".join(f"s[{at}]" for at in silent)

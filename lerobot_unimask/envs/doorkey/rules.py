@@ -8,8 +8,8 @@
       4 # . . # G #      actions: right 0, down 1, left 2, up 3
       5 # # # # # #
 
-The rules come twice, and a test holds them together: as functions of arrays, which broadcast over any number of states
-(`step`, `reward`, `expert_probabilities`), and as `DoorKeyEnv`, which plays them on MiniGrid's own objects.
+The rules come twice, and a test holds them together: here, as functions of arrays, which broadcast over any number of
+states, and in `environment`, where `DoorKeyEnv` plays them on MiniGrid's own objects.
 
 A cell is numbered 4 (y - 1) + (x - 1). A state is (agent cell, key cell, door open): a carried key is where the agent
 is, and stepping on the key picks it up, so the agent carries it exactly when the two cells are equal.

@@ -54,7 +54,7 @@ def draw_ways(states: np.ndarray, maze: str = "medium") -> Figure:
     return figure
 
 
-def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str = "medium", window: int = 0) -> Figure:
+def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str = "medium") -> Figure:
     """Predicted positions with their uncertainty, the whole maze and a close view.
 
     An ellipse reaches two scales to each side of a mean; a model with an L2 head has no scales, and no ellipses.
@@ -63,15 +63,14 @@ def maze_trajectories(answer: Answer, truth: Window | None = None, *, maze: str 
         answer: one to a question about `s` of a Maze2D model.
         truth: recorded windows, to draw beside it.
         maze: name or text of the maze.
-        window: number of the answer's window that is drawn.
     """
     (state,) = (part for part in answer["s"] if isinstance(part, ContinuousDistribution))
-    mean = state.most_likely[window].numpy(force=True)  # (K, 4): x, y, goal x, goal y
-    weights, means = (part[window].numpy(force=True) for part in (state.weights, state.means))  # (K, n), (K, n, 4)
-    scales = np.zeros_like(means) if state.scales is None else state.scales[window].numpy(force=True)
-    scale = None if state.scale is None else state.scale[window].numpy(force=True)
-    shown = answer.mask.shown["s"][window].numpy(force=True)  # (K,)
-    recorded = None if truth is None else truth.values["s"][window][truth.valid[window]].numpy(force=True)
+    mean = state.most_likely[0].numpy(force=True)  # (K, 4): x, y, goal x, goal y
+    weights, means = (part[0].numpy(force=True) for part in (state.weights, state.means))  # (K, n), (K, n, 4)
+    scales = np.zeros_like(means) if state.scales is None else state.scales[0].numpy(force=True)
+    scale = None if state.scale is None else state.scale[0].numpy(force=True)
+    shown = answer.mask.shown["s"][0].numpy(force=True)  # (K,)
+    recorded = None if truth is None else truth.values["s"][0][truth.valid[0]].numpy(force=True)
     goal = mean[~np.isnan(mean[:, 2])][0, 2:] if recorded is None else recorded[0, 2:]
     figure = Figure(figsize=(WIDTH, 4.4), layout="constrained")
     whole, close = figure.subplots(1, 2)

@@ -1,11 +1,4 @@
-"""Maze2D: D4RL's point mass in a maze, on MuJoCo, with the velocity hidden (UniMASK, section 5.2).
-
-Rows of a maze's text lie along x, columns along y. All positions are joint positions, in cells: cell (row, column)
-is the position (row, column).
-
-Note: the mass's body stands at (1.2, 1.2) and the walls' boxes at (row + 1, column + 1), so the middle of a cell's
-free space is the joint position (row - 0.2, column - 0.2). That is D4RL's quirk, kept, and the drawing shows it.
-"""
+"""Maze2D from above: a video's frames, and what a camera sees."""
 
 from collections.abc import Sequence
 from functools import lru_cache
