@@ -17,12 +17,11 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_unimask.asking.acting import act, check_settings, new_memory, observed_return, observed_state, plan_from
-from lerobot_unimask.asking.answers import Answer, answer
+from lerobot_unimask.asking.answers import Answer, answer, predict, without_dropout
 from lerobot_unimask.asking.given import Given
 from lerobot_unimask.asking.held_out import HeldOutActions
 from lerobot_unimask.asking.looking import observed_pictures
 from lerobot_unimask.asking.memory import RolloutMemory
-from lerobot_unimask.asking.predicting import predict, without_dropout
 from lerobot_unimask.asking.questions import pose_question
 from lerobot_unimask.asking.sampling import Check, Samples, check_count, make_generator, sample
 from lerobot_unimask.configuration_unimask import FINE_FROM, UniMASKConfig, read_config
@@ -38,9 +37,8 @@ from lerobot_unimask.machine import keep_freed_memory, wait_without_spinning
 from lerobot_unimask.networks import make_network
 from lerobot_unimask.networks.growing import fitted, saved_config
 from lerobot_unimask.networks.layers import Cache, Predictions
-from lerobot_unimask.networks.losses import LossParts
 from lerobot_unimask.networks.vision import parameter_groups
-from lerobot_unimask.objective import CapturedLoss, batch_loss
+from lerobot_unimask.objective import CapturedLoss, LossParts, batch_loss
 from lerobot_unimask.processor_unimask import make_unimask_pre_post_processors
 from lerobot_unimask.records import read_json
 from lerobot_unimask.sharing import cards, hub
@@ -181,7 +179,7 @@ class UniMASKPolicy(PreTrainedPolicy):
     # --- Asking ------------------------------------------------------------------------------------------------------
 
     def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
-        """What the network puts out for each asked token; see `asking.predicting.predict`."""
+        """What the network puts out for each asked token; see `asking.answers.predict`."""
         return predict(self, window, mask, cache)
 
     def make_window(self, batch: Mapping[str, Any], *, partial: bool = False) -> Window:

@@ -9,7 +9,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -101,14 +101,27 @@ class Source:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a question: marginals, or samples where those were asked for; what was recorded; the exact optimum's
-    marginals, where those were asked for too; and the pictures that were shown, (H, W, C) by token."""
+    """A question, as `ask` takes it, and what came of it.
 
+    Attributes:
+        mask: its mask, of one window.
+        answer: marginals, or samples where those were asked for.
+        recorded: what was recorded.
+        best: the exact optimum's marginals, where those were asked for too.
+        pictures: those that were shown, (H, W, C) by token.
+    """
+
+    question: str
+    source: Source | None
+    t: int | None
+    given: Given | None
+    sampling: Sampling | None
+    exact: str | None
     mask: Mask
     answer: Answer | Samples
     recorded: Window | None
-    exact: Answer | None = None
-    pictures: Mapping[str, Tensor] = field(default_factory=dict)
+    best: Answer | None
+    pictures: Mapping[str, Tensor]
 
 
 def ask(
@@ -135,34 +148,29 @@ def ask(
     """
     recorded = None if batch is None else policy.make_window(batch, partial=True)
     start = source.start if source else 0
-    table = tabulate(mask, tuple(policy.factors), policy.config.context_length, tuple(policy.cameras))
-    question = table.at(t).to(policy.device)
-    if recorded is not None:
-        question = question.within(recorded.valid)
-        if not any(asked.any() for asked in question.asked.values()):
-            raise ValueError(
-                f"The episode ends before what is asked: of the window's {policy.config.context_length} steps it has "
-                f"{int(recorded.valid.sum())}. Start earlier or ask for an earlier step."
-            )
+    window, question = pose_question(policy, recorded, mask, t, given)
+    if len(window.valid) > 1:
+        raise ValueError(f"Values for {len(window.valid)} windows are given; give one value for each token.")
+    if not any(asked.any() for asked in question.asked.values()):
+        raise ValueError(
+            f"The episode ends before what is asked: of the window's {policy.config.context_length} steps it has "
+            f"{int(window.valid.sum())}. Start earlier or ask for an earlier step."
+        )
     answer: Answer | Samples
     if sampling is None:
-        answer = policy.infer(recorded, mask, t=t, given=given)
-        windows = len(answer.mask.shown["s"])
+        answer = policy.infer(window, question)
     else:
         check = make_check(policy, sampling.check, start) if sampling.check else None
         n, order, seed = sampling.samples, sampling.order, sampling.seed
-        answer = policy.sample(recorded, mask, t=t, given=given, samples=n, order=order, seed=seed, check=check)
-        windows = len(answer.valid) // sampling.samples
-    if windows > 1:
-        raise ValueError(f"Values for {windows} windows are given; give one value for each token.")
+        answer = policy.sample(window, question, samples=n, order=order, seed=seed, check=check)
     best = None
     if exact is not None:
         optimum = optimum_of(_environment(policy), exact, provenance_of(source.folder) if source else {})
-        window, shown = pose_question(policy, recorded, mask, t, given)
         cpu = torch.device("cpu")
-        best = optimum.answer(window.to(cpu), shown.to(cpu), expert=exact, first_step=start)
+        best = optimum.answer(window.to(cpu), question.to(cpu), expert=exact, first_step=start)
     own = read_given(given or {}, policy.factors, policy.config.context_length, 1, policy.cameras)
-    return Reply(question, answer, recorded, best, shown_pictures(policy, recorded, question, own))
+    pictures = shown_pictures(policy, recorded, question, own)
+    return Reply(mask, source, t, given, sampling, exact, question, answer, recorded, best, pictures)
 
 
 def _environment(policy: UniMASKPolicy) -> Environment | None:
@@ -211,7 +219,7 @@ def rows(policy: UniMASKPolicy, reply: Reply) -> list[dict[str, Any]]:
                     row = {"token": f"{name}[{step}]", "step": step, "factor": name, "component": label}
                     if component.labels:
                         said["label"] = component.labels[said.get("most_likely", said.get("most_frequent", 0))]
-                    exact = {} if reply.exact is None else {"exact": _of_marginals(reply.exact, name, step, i)}
+                    exact = {} if reply.best is None else {"exact": _of_marginals(reply.best, name, step, i)}
                     table.append({**row, **said, **exact, "recorded": recorded})
     return table
 
@@ -239,29 +247,19 @@ def _of_samples(values: Tensor, categories: int | None) -> dict[str, Any]:
     return {"most_frequent": best, "share": shares[best].item(), "shares": shares.tolist()}
 
 
-def record(
-    policy: UniMASKPolicy,
-    mask: str,
-    reply: Reply,
-    *,
-    source: Source | None,
-    t: int | None,
-    given: Given | None,
-    sampling: Sampling | None,
-    exact: str | None = None,
-) -> dict[str, Any]:
-    """Everything that decides an answer, and the answer, for a JSON; arguments as those of `ask`."""
-    data = None
+def record(policy: UniMASKPolicy, reply: Reply) -> dict[str, Any]:
+    """Everything that decides an answer, and the answer, for a JSON."""
+    data, source, sampling = None, reply.source, reply.sampling
     if source is not None:
         root = str(source.root) if source.root else None
         data = {"root": root, "repo_id": source.repo_id, "episode": source.episode, "start": source.start}
     result: dict[str, Any] = {
         "policy": policy.describe_origin(),
-        "mask": mask,
-        "t": t,
-        "given": dict(given or {}),
+        "mask": reply.question,
+        "t": reply.t,
+        "given": dict(reply.given or {}),
         "data": data,
-        "exact": exact,
+        "exact": reply.exact,
         "drawing": reply.mask.draw(),
         "units": "those of the dataset; probabilities and shares from 0 to 1",
         "answers": rows(policy, reply),
@@ -416,19 +414,19 @@ def describe_overview(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def picture(policy: UniMASKPolicy, mask: str, reply: Reply, *, source: Source | None = None) -> Figure:
+def picture(policy: UniMASKPolicy, reply: Reply) -> Figure:
     """The picture that suits the environment and the answer, under those that the question shows."""
-    figure = _picture_of_answer(policy, mask, reply, source)
+    figure = _picture_of_answer(policy, reply)
     add_thumbnails(figure, {token: shown.numpy() for token, shown in reply.pictures.items()})
     return figure
 
 
-def _picture_of_answer(policy: UniMASKPolicy, mask: str, reply: Reply, source: Source | None) -> Figure:
+def _picture_of_answer(policy: UniMASKPolicy, reply: Reply) -> Figure:
     """That of the environment; of any other model, its marginals or distributions."""
     environment = _environment(policy)
     if environment is not None and environment.draw_answer is not None:
-        provenance = provenance_of(source.folder) if source else {}
-        figure = environment.draw_answer(mask, reply.answer, reply.mask, reply.recorded, provenance)
+        provenance = provenance_of(reply.source.folder) if reply.source else {}
+        figure = environment.draw_answer(reply.question, reply.answer, reply.mask, reply.recorded, provenance)
         if figure is not None:
             return figure
     if not isinstance(reply.answer, Samples):

@@ -24,7 +24,7 @@ from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK, TASKS
 from lerobot_unimask.language.training_masks import validation_masks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.networks.losses import masked_losses
+from lerobot_unimask.objective import masked_losses
 from lerobot_unimask.records import versions
 
 logger = logging.getLogger(__name__)

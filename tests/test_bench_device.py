@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from lerobot_unimask.bench import beside, clock, contender
-from lerobot_unimask.bench.device import QUICK, markdown
+from lerobot_unimask.bench.device import QUICK
 from lerobot_unimask.bench.tables import beside as table
+from lerobot_unimask.bench.tables import device as device_tables
 from lerobot_unimask.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +37,7 @@ def test_the_short_form_measures_everything(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
 def test_the_pages_tables_are_those_of_the_record(path):
-    assert markdown(json.loads(path.read_text())) in (ROOT / "docs" / "speed.md").read_text()
+    assert device_tables(json.loads(path.read_text())) in (ROOT / "docs" / "speed.md").read_text()
 
 
 def test_a_device_that_is_not_there_is_refused(capsys, tmp_path):

@@ -359,6 +359,6 @@ def test_a_query_names_and_draws_the_pictures_shown(make, batch, tmp_path):
     assert list(reply.pictures) == ["top[0]", "wrist[2]", f"top[{K - 1}]"]
     assert reply.pictures[f"top[{K - 1}]"].max() == 0
     assert torch.equal(reply.pictures["wrist[2]"], one[COLUMNS["wrist"]][0, 2].permute(1, 2, 0))
-    figure = query.picture(policy, question, reply)
+    figure = query.picture(policy, reply)
     assert [axes.get_title() for axes in figure.axes][-3:] == list(reply.pictures)
     figure.savefig(tmp_path / "answer.png")

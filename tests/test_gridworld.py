@@ -18,13 +18,13 @@ from lerobot_unimask.envs.doorkey.panels import (
     backwards_panel,
     five_panels,
     given_states,
-    possible_steps,
     predicted_states,
     rollout,
     rollout_panel,
     state_at,
 )
 from lerobot_unimask.envs.doorkey.rules import GOAL, HORIZON, START_PAIRS, reward, step
+from lerobot_unimask.paper.questions import possible_steps
 
 IMITATION, _ = ROLLOUTS["Imitation"]
 

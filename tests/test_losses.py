@@ -9,7 +9,7 @@ import torch
 from lerobot_unimask.data.factors import Feature, make_factors
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.networks.layers import by_component
-from lerobot_unimask.networks.losses import masked_losses, output_loss
+from lerobot_unimask.objective import masked_losses, output_loss
 
 B, K = 5, 4
 FEATURES = {

@@ -6,12 +6,13 @@ import pytest
 import torch
 from torch import nn
 
+from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import Feature, make_factors
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.networks.feedforward import FeedForward
 from lerobot_unimask.networks.layers import Block, Cache, Dropout, NumberEncoding, course
-from lerobot_unimask.networks.losses import masked_losses
 from lerobot_unimask.networks.transformer import Transformer
+from lerobot_unimask.objective import masked_losses
 
 B, K = 3, 5
 LAYOUTS = ("stacked", "separate", "stacked, plain inputs", "feedforward")  # of the transformer, and the perceptron
@@ -34,12 +35,12 @@ KINDS = {
 def make_network(kind, layout, dropout=0.0):
     factors = make_factors(KINDS[kind], joint=kind == "mixed")
     torch.manual_seed(0)
-    sizes = {"context_length": K, "width": 16, "depth": 2, "feedforward_width": 16, "dropout": dropout}
-    if layout == "feedforward":
-        return FeedForward(factors, fine_inputs=True, **sizes).eval(), factors
-    stacked, fine = "stacked" in layout, "plain" not in layout
-    network = Transformer(factors, stacked=stacked, residuals=fine, fine_inputs=fine, heads=2, **sizes)
-    return network.eval(), factors
+    sizes = {"context_length": K, "width": 16, "depth": 2, "heads": 2, "feedforward_width": 16, "dropout": dropout}
+    if "stacked" in layout:
+        sizes |= {"token_layout": "stacked", "attention": "bidirectional"}
+    fine = "plain" not in layout
+    config = UniMASKConfig(ask_properties=False, state_residuals=fine, fine_inputs=fine, **sizes)
+    return (FeedForward if layout == "feedforward" else Transformer)(config, factors).eval(), factors
 
 
 def random_window(factors, seed=0):
@@ -229,15 +230,18 @@ def test_states_that_go_straight_on_are_predicted_before_anything_is_learnt():
 
 @pytest.mark.parametrize(
     ("network", "settings"),
-    [(Transformer, {"stacked": True, "residuals": False, "heads": 2, "depth": 1}), (FeedForward, {"depth": 2})],
+    [
+        (Transformer, {"token_layout": "stacked", "attention": "bidirectional", "heads": 2, "depth": 1}),
+        (FeedForward, {"depth": 2}),
+    ],
 )
 def test_a_network_learns_what_a_mask_hides(network, settings):
     """Forward dynamics of a ring, s[k + 1] = (s[k] + 1) mod 7, from one shown state: model and loss together."""
     torch.manual_seed(0)
     factors = make_factors({"s": [Feature("observation.state", 1, [7])], "a": [Feature("action", 1)]})
-    network = network(
-        factors, context_length=K, fine_inputs=False, width=32, feedforward_width=32, dropout=0.0, **settings
-    )
+    plain = {"fine_inputs": False, "state_residuals": False}
+    sizes = {"context_length": K, "width": 32, "feedforward_width": 32, "dropout": 0.0}
+    network = network(UniMASKConfig(**plain, **sizes, **settings), factors)
     starts = torch.arange(7)
     states = ((starts[:, None] + torch.arange(K)) % 7).float().unsqueeze(-1)  # (7, K, 1)
     window = Window({"s": states, "a": torch.zeros(7, K, 1)}, torch.ones(7, K, dtype=torch.bool))
@@ -269,9 +273,8 @@ def test_a_mixture_learns_a_fork_where_one_gaussian_points_between():
         factors = make_factors(
             {"s": [Feature("observation.state", 2)], "a": [Feature("action", 1)]}, gaussians=gaussians
         )
-        network = FeedForward(
-            factors, context_length=2, fine_inputs=False, width=8, depth=1, feedforward_width=32, dropout=0.0
-        )
+        sizes = {"context_length": 2, "width": 8, "depth": 1, "feedforward_width": 32, "dropout": 0.0}
+        network = FeedForward(UniMASKConfig(fine_inputs=False, **sizes), factors)
         optimiser = torch.optim.Adam(network.parameters(), lr=2e-2)
         for _ in range(200):
             loss = masked_losses(network(window, shown), window, asked, factors)["s"]
@@ -359,7 +362,7 @@ def test_a_rollouts_cache_changes_no_prediction_and_computes_each_token_once(kin
 
 @pytest.mark.parametrize("windows", [1, 5])
 def test_the_last_token_of_a_block_needs_no_keys_and_values_of_the_others(windows):
-    block = Block(24, 3, 48, 0.1).eval()
+    block = Block(UniMASKConfig(width=24, heads=3, feedforward_width=48)).eval()
     x = torch.randn(windows, 7, 24)
     expected = block(x, torch.ones(7, 7, dtype=torch.bool).tril(), None)[0][:, -1:]
     torch.testing.assert_close(block.last(x), expected, rtol=1e-5, atol=1e-6)
@@ -419,7 +422,7 @@ def test_dropout_leaves_out_its_share_and_keeps_the_mean(share):
 
 
 def test_attention_with_dropout_is_pytorchs_where_nothing_is_left_out():
-    block = Block(16, 2, 16, dropout=0.0)
+    block = Block(UniMASKConfig(width=16, heads=2, feedforward_width=16, dropout=0.0))
     query, key, value = torch.randn(3, 2, 2, 5, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
     attend = torch.ones(5, 5, dtype=torch.bool).tril()
     expected = [block._attend(query, key, value, mask) for mask in (None, attend)]

@@ -28,7 +28,7 @@ from lerobot_unimask.envs.doorkey.rules import DOOR, GOAL, START_PAIRS, Dynamics
 from lerobot_unimask.language.masks import TASKS, Mask, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.networks.layers import by_component
-from lerobot_unimask.networks.losses import masked_losses
+from lerobot_unimask.objective import masked_losses
 
 EXPERTS = ("paper", "released")
 # Twenty masks that show little enough for many of a million episodes to agree; four with the return.

@@ -171,7 +171,7 @@ def test_a_recording_of_others_trains_and_is_asked(form, request, tmp_path, caps
     np.testing.assert_allclose(window.values["s"][0], expected, atol=1e-5)
     reply = query.ask(policy, "a[0] | s[0]", batch=read_window(dataset, 1))
     assert {row["factor"] for row in query.rows(policy, reply)} == {"a"}
-    picture = query.picture(policy, "a[0] | s[0]", reply)
+    picture = query.picture(policy, reply)
     assert picture.axes[0].get_ylabel().startswith("a")
 
 

@@ -117,13 +117,13 @@ def test_a_query_tells_and_draws_them(tiny_policy, batch):
     ]
     answer = policy.infer(one, QUESTION)
     assert rows[0]["mean"] == answer["rtg"][0].mean[0, 0].item()
-    figure = query.picture(policy, QUESTION, reply)
+    figure = query.picture(policy, reply)
     bars = [bar.get_height() for bar in figure.axes[1].patches]
     assert bars == pytest.approx(answer["success"][0].probabilities[0, 0].tolist())
     sampled = query.ask(policy, QUESTION, batch=one, sampling=query.Sampling(20))
     shares = query.rows(policy, sampled)[1]["shares"]
     assert sum(shares) == pytest.approx(1)
-    assert query.picture(policy, QUESTION, sampled).axes
+    assert query.picture(policy, sampled).axes
 
 
 # --- Checkpoints ------------------------------------------------------------------------------------------------------

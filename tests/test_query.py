@@ -134,7 +134,7 @@ def test_the_optimum_is_that_of_the_expert_that_is_named(tiny_policy):
     """Up is a bump from there, which the two count differently."""
     given = {"s[0]": [0, 5]}
     up = {
-        expert: query.ask(tiny_policy(), "a[0] | s[0]", given=given, exact=expert).exact["a"][0].probabilities[0, 0, 3]
+        expert: query.ask(tiny_policy(), "a[0] | s[0]", given=given, exact=expert).best["a"][0].probabilities[0, 0, 3]
         for expert in ("paper", "released")
     }
     for expert, probability in up.items():
@@ -188,7 +188,7 @@ def test_continuous_answers_have_means_and_scales(tiny_policy, continuous_batch)
         assert row["recorded"] == pytest.approx(recorded[i].item())
     sampling = Sampling(20)
     reply = query.ask(policy, "s[1] | s[0]", batch=batch, sampling=sampling)
-    result = query.record(policy, "s[1] | s[0]", reply, t=None, given=None, source=None, sampling=sampling)
+    result = query.record(policy, reply)
     assert "±" in query.describe(json.loads(json.dumps(result)))
     assert query.rows(policy, query.ask(tiny_policy("continuous"), "s[1] | s[0]", batch=batch))[0]["scale"] is None
 
@@ -228,8 +228,8 @@ def test_a_maze_is_drawn_with_the_walls_of_its_data(tiny_policy, tmp_path):
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "provenance.json").write_text('{"maze": "umaze"}')
     policy = tiny_policy("continuous", features=MAZE, stats=MAZE_STATS)
-    reply = query.ask(policy, "s[1:] | s[0]", given={"s[0]": [1, 1, 2, 2]})
-    drawn = query.picture(policy, "s[1:] | s[0]", reply, source=source)
+    reply = query.ask(policy, "s[1:] | s[0]", given={"s[0]": [1, 1, 2, 2]}, source=source)
+    drawn = query.picture(policy, reply)
     assert len(drawn.axes[0].patches) == "".join(parse_maze("umaze").rows).count("#")
 
 

@@ -9,12 +9,12 @@ Legend of shapes: B environments, K steps, D the numbers of a factor, H actions 
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lerobot_unimask.asking.answers import Model, answer
+from lerobot_unimask.asking.answers import LearntModel, Model, answer
 from lerobot_unimask.asking.given import (
     Given,
     check_known,
@@ -25,35 +25,21 @@ from lerobot_unimask.asking.given import (
     read_given,
     text_of,
 )
-from lerobot_unimask.asking.looking import LookingModel, look_at_given
+from lerobot_unimask.asking.looking import look_at_given
 from lerobot_unimask.asking.memory import NO_RETURN_SO_FAR, RolloutMemory
 from lerobot_unimask.asking.sampling import sample as draw_jointly
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import RETURN_SO_FAR, TASK, Camera, Factor, category_numbers
-from lerobot_unimask.data.returns import EpisodeStarts
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import Mask, MaskTable, Token, tabulate
-from lerobot_unimask.language.training_masks import TrainingMasks
 from lerobot_unimask.networks.layers import Cache
 
 logger = logging.getLogger(__name__)
 
 
-class ActingModel(Model, LookingModel, Protocol):
-    """A model with its config, what it was trained on, and what it keeps of its training episodes."""
-
-    config: UniMASKConfig
-    training_masks: TrainingMasks
-    episode_starts: EpisodeStarts
-
-    def make_window(self, batch: Mapping[str, Any], *, partial: bool = False) -> Window:
-        """A LeRobot batch in the dataset's units."""
-        ...
-
-
 def act(
-    model: ActingModel,
+    model: LearntModel,
     memory: RolloutMemory,
     state: Tensor,
     return_so_far: Tensor | None,
@@ -84,7 +70,7 @@ def act(
 
 
 def plan_from(
-    model: ActingModel,
+    model: LearntModel,
     state: Tensor,
     pictures: Mapping[str, Tensor],
     task: str | Sequence[str] | None,
@@ -121,7 +107,7 @@ def plan_from(
     return as_action(model, plan(model, memory, model.config.chunk_size, prefix=prefix, **question))
 
 
-def _on_their_way(model: ActingModel, inference_delay: int, left_over: Tensor | None) -> Tensor | None:
+def _on_their_way(model: LearntModel, inference_delay: int, left_over: Tensor | None) -> Tensor | None:
     """(1, d, D) of the actions that will have been carried out, d at most the delay and the chunk."""
     if inference_delay < 0:
         raise ValueError(f"inference_delay is {inference_delay}; it counts steps, from 0 on.")
@@ -138,7 +124,7 @@ def _on_their_way(model: ActingModel, inference_delay: int, left_over: Tensor | 
 
 
 def plan(
-    model: ActingModel,
+    model: LearntModel,
     memory: RolloutMemory,
     size: int,
     *,
@@ -214,7 +200,7 @@ def _history(question: Mask, present: int, step: int, name: str) -> Mask:
     return Mask(shown, asked)
 
 
-def _follow_on(model: ActingModel, question: Mask, present: int, size: int) -> bool:
+def _follow_on(model: LearntModel, question: Mask, present: int, size: int) -> bool:
     """Whether the model has learnt to answer the actions of a chunk, and the states between them, causally."""
     if question.shown["s"][:, present + 1 :].any() or question.shown["a"][:, present + size :].any():
         return False
@@ -225,7 +211,7 @@ def _follow_on(model: ActingModel, question: Mask, present: int, size: int) -> b
 
 
 def _one_by_one(
-    model: ActingModel,
+    model: LearntModel,
     window: Window,
     question: Mask,
     present: int,
@@ -265,7 +251,7 @@ def _ask_chunk(
         known["a"][begun] = True
 
 
-def new_memory(model: ActingModel, batch_size: int) -> RolloutMemory:
+def new_memory(model: LearntModel, batch_size: int) -> RolloutMemory:
     """An empty memory. The present goes as far as `n_obs_steps` lets acting remember, and leaves room for a chunk."""
     config = model.config
     remembered = config.n_obs_steps or config.context_length
@@ -292,7 +278,7 @@ def acting_table(
     return table
 
 
-def target_return(model: ActingModel, memory: RolloutMemory) -> Tensor | None:
+def target_return(model: LearntModel, memory: RolloutMemory) -> Tensor | None:
     """The return to ask for from the episode's first step on, (B, 1) or (1, 1); None: nobody asks for one."""
     target = model.config.target_return
     if target is None:
@@ -302,7 +288,7 @@ def target_return(model: ActingModel, memory: RolloutMemory) -> Tensor | None:
     return torch.tensor([[float(target)]], device=model.device)
 
 
-def observed_state(model: ActingModel, batch: Mapping[str, Tensor]) -> Tensor:
+def observed_state(model: LearntModel, batch: Mapping[str, Tensor]) -> Tensor:
     """(B, D) of the present step's `s`.
 
     Raises:
@@ -331,7 +317,7 @@ def observed_state(model: ActingModel, batch: Mapping[str, Tensor]) -> Tensor:
     return state
 
 
-def observed_return(model: ActingModel, batch: Mapping[str, Any], batch_size: int) -> Tensor | None:
+def observed_return(model: LearntModel, batch: Mapping[str, Any], batch_size: int) -> Tensor | None:
     """(B,) rewards received so far, where the environment reports them.
 
     Raises:

@@ -1,22 +1,28 @@
 """Answers: the distribution of every asked token given the shown ones, in the dataset's units.
 
-Acting and sampling are questions too, so everything here goes through `answer`; there is no second path.
+Acting and sampling are questions too, so everything goes through `answer`; there is no second path. Which way a window
+is read follows from what is asked: `predict` says how.
 
 Legend of shapes: B windows, K steps, D the numbers of a factor, d those of one of its components.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import Component, Factor, Output
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.data.factors import Camera, Component, Factor, Output
+from lerobot_unimask.data.returns import EpisodeStarts
 from lerobot_unimask.data.window import Statistics, Window
+from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import ASKABLE, Mask
+from lerobot_unimask.language.training_masks import TrainingMasks, check_predicted
 from lerobot_unimask.networks.layers import Cache, Predictions
 
 
@@ -30,6 +36,22 @@ class Model(Protocol):
 
     def predict(self, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
         """A network's outputs for a window of normalised values."""
+        ...
+
+
+class LearntModel(Model, Protocol):
+    """What is asked and acts: a policy, of which there is its config, its network, what it was trained on, and what it
+    keeps of its training episodes."""
+
+    config: UniMASKConfig
+    cameras: Mapping[str, Camera]
+    network: nn.Module
+    training_masks: TrainingMasks
+    episode_starts: EpisodeStarts
+    device: torch.device
+
+    def make_window(self, batch: Mapping[str, Any], *, partial: bool = False) -> Window:
+        """A LeRobot batch in the dataset's units."""
         ...
 
 
@@ -302,3 +324,54 @@ def answer(
                     scales = torch.where(there, torch.where(here, 0.0, scales), torch.nan)
                 distributions[name].append(ContinuousDistribution(output, weights, means, scales))
     return Answer(mask, distributions)
+
+
+@contextmanager
+def without_dropout(model: nn.Module) -> Iterator[None]:
+    """Answers are given in evaluation mode, also while the model is being trained."""
+    was_training = model.training
+    if was_training:  # each change of mode walks through all modules
+        model.eval()
+    try:
+        yield
+    finally:
+        if was_training:
+            model.train()
+
+
+def predict(model: LearntModel, window: Window, mask: Mask, cache: Cache | None = None) -> Predictions:
+    """What the network puts out for each asked token. A token that follows a history shown in full is predicted
+    causally, where the model has learnt that, and every other one in both directions; so a token's answer does not
+    depend on what else is asked.
+
+    Args:
+        window: normalised values.
+        cache: what the rollout that asks has computed before; of a causal prediction that is not computed again.
+
+    Raises:
+        MaskError: the model attends causally alone and has not learnt to answer this, or asks for what it does not
+            predict.
+    """
+    network = model.network
+    if cache is not None and cache.question is mask:
+        return network(window, mask.shown, True, cache, mask.asked)
+    causally = model.training_masks.answered_causally(mask)
+    check_predicted(mask, model.config.predicted(mask.asked))
+    if all(torch.equal(causally[name], asked) for name, asked in mask.asked.items()):
+        if cache is not None:
+            cache.question = mask
+        return network(window, mask.shown, True, cache, mask.asked)
+    if model.config.attention == "causal":
+        raise MaskError(
+            "This model attends causally alone. It was trained on "
+            f"{', '.join(model.training_masks.weights)}, and asks for one token given every state, picture and "
+            "action before it. A model of attention=both answers any question.",
+            mask.draw(),
+        )
+    predictions = network(window, mask.shown, False, asked=mask.asked)
+    if any(tokens.any() for tokens in causally.values()):
+        for name, outputs in network(window, mask.shown, True, asked=causally).items():
+            here = causally[name].unsqueeze(-1)
+            pairs = zip(outputs, predictions[name], strict=True)
+            predictions[name] = [torch.where(here, causal, other) for causal, other in pairs]
+    return predictions

@@ -8,8 +8,7 @@ import contextlib
 import torch
 from torch import Tensor
 
-from lerobot_unimask.asking.acting import ActingModel
-from lerobot_unimask.asking.answers import answer
+from lerobot_unimask.asking.answers import LearntModel, answer
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.training_masks import validation_masks
@@ -23,7 +22,7 @@ class HeldOutActions:
         self.missed = torch.zeros(2, dtype=torch.float64)  # by the policy, and by the last action repeated
 
     @torch.no_grad()
-    def add(self, model: ActingModel, window: Window, index: Tensor) -> None:
+    def add(self, model: LearntModel, window: Window, index: Tensor) -> None:
         """Ask for an action of each window that has one before it.
 
         Args:
@@ -39,7 +38,7 @@ class HeldOutActions:
             self.missed += torch.stack([_missed(model, guess, recorded) for guess in (guessed, last)]).cpu()
             self.steps += len(recorded)
 
-    def line(self, model: ActingModel) -> str | None:
+    def line(self, model: LearntModel) -> str | None:
         """The comparison in words; None where nothing was asked."""
         if not self.steps:
             return None
@@ -56,7 +55,7 @@ class HeldOutActions:
         )
 
 
-def _missed(model: ActingModel, guessed: Tensor, recorded: Tensor) -> Tensor:
+def _missed(model: LearntModel, guessed: Tensor, recorded: Tensor) -> Tensor:
     """The number of (n, D) actions that are not the recorded ones, or the sum of their mean squared distances."""
     if model.factors["a"].discrete:
         return (guessed != recorded).any(-1).double().sum()

@@ -4,28 +4,18 @@ Legend of shapes: B windows or environments, K steps, C channels, H and W pixels
 """
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from lerobot_unimask.asking.answers import LearntModel
 from lerobot_unimask.asking.given import check_picture
-from lerobot_unimask.data.factors import Camera
 from lerobot_unimask.data.window import Window, as_tensor
 from lerobot_unimask.language.masks import Mask, Token
 
-Key = TypeVar("Key", Token, tuple[str, int])
 
-
-class LookingModel(Protocol):
-    """A model with its cameras by name, and a network with an embedding of each, `cameras`."""
-
-    cameras: Mapping[str, Camera]
-    network: nn.Module
-    device: torch.device
-
-
-def look(model: LookingModel, name: str, pictures: Tensor) -> Tensor:
+def look(model: LearntModel, name: str, pictures: Tensor) -> Tensor:
     """(B, C, H, W) of one camera -> (B, D)."""
     encoder = model.network.get_submodule(f"cameras.{name}.encoder")
     return encoder(pictures.to(model.device).unsqueeze(1), pictures.new_ones(len(pictures), 1).bool().to(model.device))[
@@ -33,7 +23,7 @@ def look(model: LookingModel, name: str, pictures: Tensor) -> Tensor:
     ]
 
 
-def look_at_window(model: LookingModel, window: Window, shown: Mapping[str, Tensor]) -> Window:
+def look_at_window(model: LearntModel, window: Window, shown: Mapping[str, Tensor]) -> Window:
     """The window with tokens, (B, K, D), in place of pictures: of those shown; NaN where a shown picture is, which is
     how one that is not there is marked."""
     values = dict(window.values)
@@ -46,7 +36,7 @@ def look_at_window(model: LookingModel, window: Window, shown: Mapping[str, Tens
     return Window(values, window.valid)
 
 
-def look_at_given(model: LookingModel, tokens: Mapping[Token, Tensor]) -> dict[Token, Tensor]:
+def look_at_given(model: LearntModel, tokens: Mapping[Token, Tensor]) -> dict[Token, Tensor]:
     """What is given, (B, D) or (1, D) in place of each camera's pictures."""
     return {
         token: look(model, token.factor, value) if token.factor in model.cameras else value
@@ -54,7 +44,7 @@ def look_at_given(model: LookingModel, tokens: Mapping[Token, Tensor]) -> dict[T
     }
 
 
-def observed_pictures(model: LookingModel, batch: Mapping[str, Any], batch_size: int) -> dict[str, Tensor]:
+def observed_pictures(model: LearntModel, batch: Mapping[str, Any], batch_size: int) -> dict[str, Tensor]:
     """Camera -> (B, D): the tokens of the pictures that the environments show at this step.
 
     Raises:
@@ -76,7 +66,7 @@ def observed_pictures(model: LookingModel, batch: Mapping[str, Any], batch_size:
 
 
 def shown_pictures(
-    model: LookingModel, window: Window | None, mask: Mask, given: Mapping[Token, Tensor]
+    model: LearntModel, window: Window | None, mask: Mask, given: Mapping[Token, Tensor]
 ) -> dict[str, Tensor]:
     """Token -> (H, W, C), from 0 to 1: the pictures of the first window that a question shows, in the order of time."""
     found = {}

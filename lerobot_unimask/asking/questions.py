@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_unimask.asking.acting import ActingModel
+from lerobot_unimask.asking.answers import LearntModel
 from lerobot_unimask.asking.given import (
     Given,
     check_known,
@@ -28,7 +28,7 @@ from lerobot_unimask.language.masks import Mask, tabulate
 
 
 def pose_question(
-    model: ActingModel,
+    model: LearntModel,
     window: Window | Mapping[str, Tensor] | None,
     mask: Mask | str,
     t: int | None,

@@ -15,9 +15,7 @@ from typing import Any
 
 import lerobot_unimask
 from lerobot_unimask.bench import contender
-from lerobot_unimask.bench.clock import spread
-from lerobot_unimask.machine import describe_machine
-from lerobot_unimask.records import commit, versions
+from lerobot_unimask.bench.clock import circumstances, spread
 
 WORKS = {
     "random": f"update on random masks, {contender.BATCH} windows",
@@ -53,11 +51,8 @@ def bench_beside(before: Path | None = None, *, avx2: bool = False, repeats: int
         "sizes": {
             name: getattr(contender, name) for name in ("STATE", "ACTIONS", "CONTEXT", "WIDTH", "HEADS", "INNER")
         },
-        "machine": describe_machine(),
         "avx2": avx2,
-        "load_at_start": round(os.getloadavg()[0], 2),
-        "commit": commit(),
-        "versions": versions(),
+        **circumstances(),
         "ms": {},
     }
     with ExitStack() as stack:

@@ -18,6 +18,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from lerobot_unimask.machine import describe_machine
+from lerobot_unimask.records import commit, versions
+
+
+def circumstances() -> dict[str, Any]:
+    """Where and of what a record is: machine, versions, and the processes that wanted a core as it began: above 0 other
+    work disturbs it."""
+    load = round(os.getloadavg()[0], 2)
+    return {"machine": describe_machine(), "load_at_start": load, "commit": commit(), "versions": versions()}
+
 
 def alone(label: str, measure: Callable[..., dict[str, Any]], *arguments: Any, **keywords: Any) -> dict[str, Any]:
     """What a function of this module returns in a process of its own, with that process's seconds and peak memory."""

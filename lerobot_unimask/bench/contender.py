@@ -126,31 +126,44 @@ def masked_autoencoder() -> Work:
     return work
 
 
-def decision_transformer() -> Work:
-    """transformers' own, with as many layers and its own dropout; it imitates alone."""
+def transformers_own(
+    state: int, actions: int, layers: int, heads: int, device: str = "cpu"
+) -> tuple[nn.Module, Callable[[int], Callable[[], Tensor]]]:
+    """transformers' Decision Transformer with its own dropout, and what draws so many windows, once, and then answers
+    for them: the error of the actions that it predicts."""
     from transformers import DecisionTransformerConfig, DecisionTransformerModel
 
-    config = DecisionTransformerConfig(
-        state_dim=STATE, act_dim=ACTIONS, hidden_size=WIDTH, n_layer=3, n_head=HEADS, n_inner=INNER, max_ep_len=1000
-    )
-    model = DecisionTransformerModel(config)
-    optimiser = torch.optim.AdamW(model.parameters(), fused=True)
+    sizes = {"hidden_size": WIDTH, "n_layer": layers, "n_head": heads, "n_inner": INNER, "max_ep_len": 1000}
+    model = DecisionTransformerModel(DecisionTransformerConfig(state_dim=state, act_dim=actions, **sizes)).to(device)
 
-    def answer(size: int) -> tuple[Tensor, Tensor]:
-        states, actions = torch.randn(size, CONTEXT, STATE), torch.randn(size, CONTEXT, ACTIONS)
-        returns, steps = torch.randn(size, CONTEXT, 1), torch.arange(CONTEXT).expand(size, -1)
-        here = torch.ones(size, CONTEXT, dtype=torch.long)
-        return actions, model(states, actions, returns, returns, steps, attention_mask=here).action_preds
+    def windows(count: int) -> Callable[[], Tensor]:
+        shape = (count, CONTEXT)
+        states, taken, returns = (torch.randn(*shape, size, device=device) for size in (state, actions, 1))
+        steps = torch.arange(CONTEXT, device=device).expand(shape)
+        here = torch.ones(shape, dtype=torch.long, device=device)
+
+        def error() -> Tensor:
+            said = model(states, taken, returns, returns, steps, attention_mask=here).action_preds
+            return (said - taken).square().mean()
+
+        return error
+
+    return model, windows
+
+
+def decision_transformer() -> Work:
+    """transformers' own, with as many layers; it imitates alone."""
+    model, windows = transformers_own(STATE, ACTIONS, layers=3, heads=HEADS)
+    optimiser = torch.optim.AdamW(model.parameters(), fused=True)
 
     def work(what: str) -> None:
         if what == "imitation":
             model.train()
-            actions, said = answer(BATCH)
-            _update(model, optimiser, (said - actions).square().mean())
+            _update(model, optimiser, windows(BATCH)())
         else:
             with torch.inference_mode():
                 model.eval()
-                answer(int(what))
+                windows(int(what))()
 
     return work
 

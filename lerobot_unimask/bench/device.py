@@ -5,7 +5,6 @@ Each measurement runs in a process of its own. The order is that of importance, 
 `Size.seconds` is left out and named, so that the whole ends within eight minutes on a GPU.
 """
 
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,12 +26,11 @@ from torch.profiler import ProfilerActivity, profile
 
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import build_maze2d
-from lerobot_unimask.bench.clock import alone, now, spread
+from lerobot_unimask.bench.clock import alone, circumstances, now, spread
+from lerobot_unimask.bench.contender import transformers_own
 from lerobot_unimask.bench.measuring import CONFIGS, WARM_UP, acting, check_configs, run_lerobot_train
-from lerobot_unimask.machine import describe_machine
-from lerobot_unimask.records import commit, versions
 
-STATE, ACTIONS, CONTEXT = 4, 2, 10  # numbers of Maze2D's states and actions, and steps of its window
+STATE, ACTIONS = 4, 2  # numbers of Maze2D's states and actions
 
 
 @dataclass(frozen=True)
@@ -75,10 +73,7 @@ def bench_device(configs: Path, device: str, *, quick: bool = False) -> dict[str
         "what": "medians and quartiles over updates or calls; launches, kernels and waits for each update",
         "quick": quick,
         "device": device,
-        "machine": describe_machine(),
-        "load_at_start": round(os.getloadavg()[0], 2),
-        "commit": commit(),
-        "versions": versions(),
+        **circumstances(),
         "updates": {},
         "acting": {},
         "left_out": [],
@@ -209,23 +204,8 @@ def _another(name: str, batch: int, device: str) -> tuple[nn.Module, Callable[[]
             return policy.forward(windows)[0] if policy.training else policy.predict_action_chunk(observation).sum()
 
         return policy, run_act
-    from transformers import DecisionTransformerConfig, DecisionTransformerModel
-
-    model = DecisionTransformerModel(
-        DecisionTransformerConfig(
-            state_dim=STATE, act_dim=ACTIONS, hidden_size=128, n_layer=4, n_head=4, n_inner=512, max_ep_len=1000
-        )
-    ).to(device)
-    states, actions = torch.randn(batch, CONTEXT, STATE, device=device), torch.randn(batch, CONTEXT, 2, device=device)
-    rewards = torch.randn(batch, CONTEXT, 1, device=device)
-    timesteps = torch.arange(CONTEXT, device=device).expand(batch, -1)
-    here = torch.ones(batch, CONTEXT, dtype=torch.long, device=device)
-
-    def run() -> torch.Tensor:
-        said = model(states, actions, rewards, rewards, timesteps, attention_mask=here).action_preds
-        return (said - actions).square().mean()
-
-    return model, run
+    model, draw = transformers_own(STATE, ACTIONS, layers=4, heads=4, device=device)
+    return model, draw(batch)
 
 
 def _profiler() -> profile:
@@ -247,34 +227,3 @@ def _found(seconds: np.ndarray, batch: int, profiler: profile, profiled: int) ->
             "kernel_share": kernels / profiled / step,
         }
     return {**found, "threads": torch.get_num_threads()}
-
-
-def markdown(record: Mapping[str, Any]) -> str:
-    """The record as two tables."""
-    machine = record["machine"]
-    where = (
-        machine["gpu"] if record["device"].startswith("cuda") else f"{machine['processor']}, {machine['cores']} cores"
-    )
-    lines = [
-        f"{where}; torch {record['versions']['torch']}, LeRobot {record['versions']['lerobot']}.",
-        "",
-        "| update | batch | ms | windows a second | launches | waits | kernels, ms | share of the time |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for name, runs in record["updates"].items():
-        for batch, run in runs.items():
-            counted = [f"{run[key]:.0f}" if key in run else "" for key in ("launches", "waits")]
-            counted.append(f"{run['kernel_ms']:.1f}" if "kernel_ms" in run else "")
-            counted.append(f"{run['kernel_share']:.0%}" if "kernel_share" in run else "")
-            step, rate = run["step_ms"]["median"], run["windows_per_second"]
-            lines.append(f"| {name} | {batch} | {step:.1f} | {rate:,.0f} | {' | '.join(counted)} |")
-    counts = list(dict.fromkeys(count for runs in record["acting"].values() for count in runs))
-    lines += ["", f"| an action, ms | {' | '.join(counts)} environments |", "| --- " * (len(counts) + 1) + "|"]
-    for name, runs in record["acting"].items():
-        cells = (f"{runs[count]['latency_ms']['median']:.1f}" if count in runs else "" for count in counts)
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    if record["left_out"]:
-        lines += ["", f"Left out for want of time: {'; '.join(record['left_out'])}."]
-    if record["failed"]:
-        lines += ["", *(f"Failed: {label}: {error}" for label, error in record["failed"].items())]
-    return "\n".join(lines)

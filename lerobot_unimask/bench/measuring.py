@@ -6,7 +6,6 @@ are untrained, which costs the same. With a GPU, clocks wait for it and its peak
 itself does is measured by `device.py`.
 """
 
-import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,15 +33,13 @@ from torch.utils.data import default_collate
 from dataset_builders.doorkey import build_doorkey
 from dataset_builders.maze2d import HORIZON, build_maze2d
 from lerobot_unimask import evaluating as lerobot_evaluation
-from lerobot_unimask.bench.clock import Stopwatch, alone, now, spread
+from lerobot_unimask.bench.clock import Stopwatch, alone, circumstances, now, spread
 from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import RETURN_SO_FAR
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
 from lerobot_unimask.language.training_masks import TrainingMasks
-from lerobot_unimask.machine import describe_machine
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.transformer import Transformer
-from lerobot_unimask.records import commit, versions
 from lerobot_unimask.training import Trainer
 
 WARM_UP = 2  # updates or calls that do not count
@@ -108,14 +105,11 @@ def bench(configs: Path, *, quick: bool = False) -> dict[str, Any]:
     """
     check_configs(configs)
     size = QUICK if quick else FULL
-    began, load = time.monotonic(), os.getloadavg()[0]
+    began = time.monotonic()
     record: dict[str, Any] = {
         "what": "medians and quartiles over repetitions; peak memory of each measurement's own process",
         "quick": quick,
-        "machine": describe_machine(),
-        "load_at_start": round(load, 2),  # processes that wanted a core: above 0 other work disturbed what follows
-        "commit": commit(),
-        "versions": versions(),
+        **circumstances(),
     }
     with tempfile.TemporaryDirectory() as folder:
         roots = {name: Path(folder) / name for name in CONFIGS}

@@ -1,4 +1,4 @@
-"""The tables of a record of `unimask bench`."""
+"""The tables of the records of `unimask bench`."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -25,84 +25,67 @@ def markdown(record: Mapping[str, Any]) -> str:
     """The record as the README's tables."""
     found = record["machine"]
     gpu = f", {found['gpu']}" if found["gpu"] else ", no GPU"
-    lines = [
+    machine = (
         f"{found['processor']}, {found['cores']} cores, {found['memory_gib']:.0f} GiB{gpu}; torch "
         f"{record['versions']['torch']}, LeRobot {record['versions']['lerobot']}. Memory is each process's peak, "
-        f"of which {record['imports']['peak_memory_mib']} MiB are imports.",
-        "",
-        "| target | bound | measured | |",
-        "| --- | --- | --- | --- |",
-        *(
-            f"| {what} | {bound} | {measured} | {'met' if met else 'missed'} |"
-            for what, bound, measured, met in targets(record)
-        ),
-        "",
-        "| median (quartiles) | this package | MiB | baseline | MiB | baseline is |",
-        "| --- | --- | --- | --- | --- | --- |",
-        *_beside_baselines(record),
-        "",
-        "| lerobot-train | ms per step | data | masks | forward | backward | optimiser | rest | MiB |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        f"of which {record['imports']['peak_memory_mib']} MiB are imports."
+    )
+    promised = [(what, bound, measured, "met" if met else "missed") for what, bound, measured, met in targets(record)]
+    training = [
+        (name, _text(run["step_ms"]), *(f"{share:.1%}" for share in run["share"].values()), run["peak_memory_mib"])
+        for name, run in record["training"].items()
     ]
-    for name, run in record["training"].items():
-        shares = " | ".join(f"{share:.1%}" for share in run["share"].values())
-        lines.append(f"| {name} | {_text(run['step_ms'])} | {shares} | {run['peak_memory_mib']} |")
+    parts = ("data", "masks", "forward", "backward", "optimiser", "rest")
     counts = list(record["acting"]["unimask"])
-    lines += [
-        "",
-        "| `select_action`, ms | " + " | ".join(f"{n} environment{'s' * (n != '1')}" for n in counts) + " | MiB |",
-        "| --- " * (len(counts) + 2) + "|",
-    ]
+    acting = []
     for name, runs in record["acting"].items():
         one = runs[counts[0]]
         how = f", {one['passes']} passes" if one["passes"] > 1 else ""
         how += f", by default for {one['actions_per_chunk']} steps" if one["actions_per_chunk"] > 1 else ""
-        cells = " | ".join(_text(runs[n]["latency_ms"]) for n in counts)
         memory = max(run["peak_memory_mib"] for run in runs.values())
-        lines.append(f"| {name} ({one['parameters'] / 1e6:.1f} M parameters{how}) | {cells} | {memory} |")
+        latencies = (_text(runs[n]["latency_ms"]) for n in counts)
+        acting.append((f"{name} ({one['parameters'] / 1e6:.1f} M parameters{how})", *latencies, memory))
+    environments = (f"{n} environment{'s' * (n != '1')}" for n in counts)
+    baseline = ("median (quartiles)", "this package", "MiB", "baseline", "MiB", "baseline is")
     rollout = record["evaluating"]["ms_per_rollout"]
-    lines += [
-        "",
+    evaluation = (
         f"Of a rollout's {rollout['total']:.0f} ms in lerobot-eval the network takes {rollout['forward']:.0f}, the "
         f"rest of acting {rollout['acting']:.1f}, the environment {rollout['environment']:.1f}, LeRobot and gymnasium "
-        f"{rollout['lerobot']:.1f}.",
-    ]
-    return "\n".join(lines) + "\n"
+        f"{rollout['lerobot']:.1f}."
+    )
+    tables = (
+        machine,
+        markdown_table(("target", "bound", "measured", "outcome"), promised),
+        markdown_table(baseline, _beside_baselines(record)),
+        markdown_table(("lerobot-train", "ms per step", *parts, "MiB"), training),
+        markdown_table(("`select_action`, ms", *environments, "MiB"), acting),
+        evaluation,
+    )
+    return "\n\n".join(tables) + "\n"
 
 
-def _beside_baselines(record: Mapping[str, Any]) -> Iterator[str]:
+def _beside_baselines(record: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
     read, build, rolled = record["reading"], record["building"], record["evaluating"]
     train = record["training"]
     per_second = {name: {"median": 1000 / build[name]["ms_per_episode"]["median"]} for name in build}
-    rows = [
+    items = train["doorkey, LeRobot's reads"]
+    stepping = per_second["stepping"], build["stepping"], "stepping the environment alone"
+    rows: list[tuple[Any, ...]] = [
         (
             "windows read per second",
-            (read["unimask"]["windows_per_second"], read["unimask"]),
-            (read["lerobot"]["windows_per_second"], read["lerobot"]),
-            "LeRobot, item by item",
+            *(read["unimask"]["windows_per_second"], read["unimask"]),
+            *(read["lerobot"]["windows_per_second"], read["lerobot"], "LeRobot, item by item"),
         ),
         (
             "DoorKey training steps per second",
-            ({"median": train["doorkey"]["steps_per_second"]}, train["doorkey"]),
-            ({"median": train["doorkey, LeRobot's reads"]["steps_per_second"]}, train["doorkey, LeRobot's reads"]),
-            "the same, read item by item",
+            *({"median": train["doorkey"]["steps_per_second"]}, train["doorkey"]),
+            *({"median": items["steps_per_second"]}, items, "the same, read item by item"),
         ),
-        (
-            "Maze2D episodes built per second",
-            (per_second["building"], build["building"]),
-            (per_second["stepping"], build["stepping"]),
-            "stepping the environment alone",
-        ),
-        (
-            "Maze2D rollouts evaluated per second",
-            ({"median": rolled["rollouts_per_second"]}, rolled),
-            (per_second["stepping"], build["stepping"]),
-            "stepping the environment alone",
-        ),
+        ("Maze2D episodes built per second", per_second["building"], build["building"], *stepping),
+        ("Maze2D rollouts evaluated per second", {"median": rolled["rollouts_per_second"]}, rolled, *stepping),
     ]
-    for what, (ours, our_run), (theirs, their_run), baseline in rows:
-        memory = our_run["peak_memory_mib"], their_run["peak_memory_mib"]
-        yield f"| {what} | {_text(ours)} | {memory[0]} | {_text(theirs)} | {memory[1]} | {baseline} |"
+    for what, ours, our_run, theirs, their_run, baseline in rows:
+        yield what, _text(ours), our_run["peak_memory_mib"], _text(theirs), their_run["peak_memory_mib"], baseline
 
 
 def _text(found: Mapping[str, Any]) -> str:
@@ -130,3 +113,33 @@ def beside(record: Mapping[str, Any]) -> str:
         rows.append((title, *(cells.get(name) for name in names)))
     heads = (name.replace("_", " ") for name in names)
     return markdown_table((f"processor ms{', AVX2' if record['avx2'] else ''}: median (least), ratio", *heads), rows)
+
+
+def device(record: Mapping[str, Any]) -> str:
+    """The tables of `unimask bench --device`."""
+    machine = record["machine"]
+    on_gpu = record["device"].startswith("cuda")
+    where = machine["gpu"] if on_gpu else f"{machine['processor']}, {machine['cores']} cores"
+    versions = record["versions"]
+    updates = []
+    for name, runs in record["updates"].items():
+        for batch, run in runs.items():
+            shown = {"launches": "{:.0f}", "waits": "{:.0f}", "kernel_ms": "{:.1f}", "kernel_share": "{:.0%}"}
+            counted = (form.format(run[key]) if key in run else None for key, form in shown.items())
+            step, rate = run["step_ms"]["median"], run["windows_per_second"]
+            updates.append((name, batch, f"{step:.1f}", f"{rate:,.0f}", *counted))
+    counts = list(dict.fromkeys(count for runs in record["acting"].values() for count in runs))
+    acting = [
+        (name, *(f"{runs[count]['latency_ms']['median']:.1f}" if count in runs else None for count in counts))
+        for name, runs in record["acting"].items()
+    ]
+    heads = ("update", "batch", "ms", "windows a second", "launches", "waits", "kernels, ms", "share of the time")
+    parts = [
+        f"{where}; torch {versions['torch']}, LeRobot {versions['lerobot']}.",
+        markdown_table(heads, updates),
+        markdown_table(("an action, ms", *counts[:-1], f"{counts[-1]} environments"), acting),
+    ]
+    if record["left_out"]:
+        parts.append(f"Left out for want of time: {'; '.join(record['left_out'])}.")
+    parts += ["\n".join(f"Failed: {label}: {error}" for label, error in record["failed"].items())]
+    return "\n\n".join(filter(None, parts))

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from lerobot_unimask.commands.flags import add_command
+from lerobot_unimask.commands.flags import add_command, write_record
 
 
 def add(commands: Any) -> None:
@@ -34,28 +34,25 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.bench import tables
-    from lerobot_unimask.records import write_json
 
     if arguments.light:
-        from lerobot_unimask.bench import beside
+        from lerobot_unimask.bench.beside import bench_beside
 
-        record = beside.bench_beside(arguments.before, avx2=arguments.avx2)
-        write_json(arguments.output, {**record, "command": arguments.text})
-        print(tables.beside(record))
-        return
-    if arguments.device:
-        from lerobot_unimask.bench import device
+        record, table = bench_beside(arguments.before, avx2=arguments.avx2), tables.beside
+    elif arguments.device:
+        from lerobot_unimask.bench.device import bench_device
 
-        record = device.bench_device(arguments.configs, arguments.device, quick=arguments.quick)
-        write_json(arguments.output, {**record, "command": arguments.text})
-        print(device.markdown(record))
+        record, table = bench_device(arguments.configs, arguments.device, quick=arguments.quick), tables.device
+    else:
+        from lerobot_unimask.bench.measuring import bench
+
+        record, table = bench(arguments.configs, quick=arguments.quick), tables.markdown
+    write_record(arguments, record)
+    print(table(record))
+    if "growth" not in record:
         return
-    from lerobot_unimask.bench.measuring import bench
     from lerobot_unimask.plots.growth import cost_of_growth
 
-    record = bench(arguments.configs, quick=arguments.quick)
-    print(tables.markdown(record))
-    write_json(arguments.output, {**record, "command": arguments.text})
     picture = arguments.output.with_suffix(".png")
     cost_of_growth(record).savefig(picture, dpi=200)
     print(f"drawn into {picture}")

@@ -2,10 +2,16 @@
 
 import argparse
 import difflib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_unimask.pretrained import FOLDERS
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,22 +57,13 @@ def boolean(text: str) -> bool:
 
 def policy_flags(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
     """`--policy.path` and `--policy.revision`, as `arguments.path` (a list of `several`) and `arguments.revision`."""
+    which = "best" if several else "last"
     what = (
-        "a checkpoint, a lerobot-train output folder, of which the last checkpoint counts, a Hub repository, or the "
-        f"name of a policy that comes with the package: {' or '.join(FOLDERS)}"
+        f"a checkpoint, a lerobot-train output folder, of which the {which} checkpoint counts, a Hub repository, or "
+        f"the name of a policy that comes with the package: {' or '.join(FOLDERS)}{'; repeatable' * several}"
     )
-    if several:
-        parser.add_argument(
-            "--policy.path",
-            action="append",
-            required=True,
-            dest="path",
-            metavar="PATH",
-            help="a checkpoint, a lerobot-train output folder, of which the best checkpoint counts, or a Hub "
-            "repository; give it once for each seed",
-        )
-    else:
-        parser.add_argument("--policy.path", required=True, dest="path", metavar="PATH", help=what)
+    action = "append" if several else "store"
+    parser.add_argument("--policy.path", action=action, required=True, dest="path", metavar="PATH", help=what)
     parser.add_argument(
         "--policy.revision", dest="revision", metavar="COMMIT", help="commit of the Hub repository; default: newest"
     )
@@ -88,6 +85,23 @@ def check_dataset(arguments: argparse.Namespace) -> None:
     """
     if getattr(arguments, "needs_dataset", False) and arguments.root is None and arguments.repo_id is None:
         raise ValueError("Which dataset? Give its folder, --dataset.root=DIR, or its name, --dataset.repo_id=ME/NAME.")
+
+
+def open_both(arguments: argparse.Namespace) -> tuple["UniMASKPolicy", "LeRobotDataset"]:
+    """The policy and the dataset that `policy_flags` and `dataset_flags` name."""
+    from lerobot_unimask.data.episodes import open_dataset
+    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+
+    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
+    return policy, open_dataset(policy.config, arguments.root, arguments.repo_id)
+
+
+def write_record(arguments: argparse.Namespace, record: Mapping[str, Any]) -> None:
+    """Write a record, and the command that made it, to where `--output` says, if it does."""
+    from lerobot_unimask.records import write_json
+
+    if arguments.output:
+        write_json(arguments.output, {**record, "command": arguments.text})
 
 
 def output_flag(parser: argparse.ArgumentParser) -> None:

@@ -4,7 +4,7 @@ import argparse
 import json
 from typing import Any
 
-from lerobot_unimask.commands.flags import add_command, dataset_flags, policy_flags
+from lerobot_unimask.commands.flags import add_command, dataset_flags, open_both, policy_flags
 
 
 def add(commands: Any) -> None:
@@ -25,10 +25,6 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.data.episodes import open_dataset
-    from lerobot_unimask.modeling_unimask import UniMASKPolicy
     from lerobot_unimask.query import given_from_episodes
 
-    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
-    dataset = open_dataset(policy.config, arguments.root, arguments.repo_id)
-    print(json.dumps(given_from_episodes(policy, dataset, arguments.episodes, arguments.tokens)))
+    print(json.dumps(given_from_episodes(*open_both(arguments), arguments.episodes, arguments.tokens)))

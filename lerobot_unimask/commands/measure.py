@@ -4,7 +4,15 @@ import argparse
 import json
 from typing import Any
 
-from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags, positive
+from lerobot_unimask.commands.flags import (
+    add_command,
+    dataset_flags,
+    open_both,
+    output_flag,
+    policy_flags,
+    positive,
+    write_record,
+)
 
 
 def add(commands: Any) -> None:
@@ -26,18 +34,15 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    from lerobot_unimask.data.episodes import episode_numbers, open_dataset
+    from lerobot_unimask.data.episodes import episode_numbers
     from lerobot_unimask.measures import latency, measure
-    from lerobot_unimask.modeling_unimask import UniMASKPolicy
-    from lerobot_unimask.records import versions, write_json
+    from lerobot_unimask.records import versions
 
-    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
-    dataset = open_dataset(policy.config, arguments.root, arguments.repo_id)
+    policy, dataset = open_both(arguments)
     episodes = episode_numbers(arguments.episodes, len(dataset.meta.episodes))
     record = measure(policy, dataset, episodes, ahead=arguments.ahead)
     record["latency"] = latency(policy)
     record["policy"] = policy.describe_origin()
-    record["command"], record["versions"] = arguments.text, versions()
+    record |= {"command": arguments.text, "versions": versions()}
     print(json.dumps(record, indent=2))
-    if arguments.output:
-        write_json(arguments.output, record)
+    write_record(arguments, record)

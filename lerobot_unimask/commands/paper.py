@@ -5,7 +5,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags, positive
+from lerobot_unimask.commands.flags import (
+    add_command,
+    dataset_flags,
+    open_both,
+    output_flag,
+    policy_flags,
+    positive,
+    write_record,
+)
 
 STUDIES = {
     "heatmap": "the paper's DoorKey heatmap: a grid of runs, shared by workers",
@@ -156,19 +164,16 @@ def _measure_acting(
 ) -> None:
     """Measure a checkpoint, print the tables and write the record."""
     from lerobot_unimask.data.checkpoints import last_checkpoint, training_settings
-    from lerobot_unimask.records import write_json
 
     folder = last_checkpoint(Path(arguments.path))
     record = measure(folder, episodes=arguments.episodes, seed=arguments.seed, **settings)
     record["training"] = training_settings(folder)
     print(markdown(record))
-    if arguments.output:
-        write_json(arguments.output, {**record, "command": arguments.text})
+    write_record(arguments, record)
 
 
 def _curve(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.paper.learning_curve import learning_curve, learning_curves
-    from lerobot_unimask.records import write_json
 
     record = learning_curve(
         arguments.runs,
@@ -178,7 +183,7 @@ def _curve(arguments: argparse.Namespace) -> None:
         batch_size=arguments.batch_size,
         seed=arguments.seed,
     )
-    write_json(arguments.output, {**record, "command": arguments.text})
+    write_record(arguments, record)
     picture = arguments.output.with_suffix(".png")
     learning_curves(record).savefig(picture, dpi=200)
     print(f"drawn into {picture}")
@@ -186,21 +191,17 @@ def _curve(arguments: argparse.Namespace) -> None:
 
 def _questions(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.data.checkpoints import training_settings
-    from lerobot_unimask.data.episodes import first_windows, open_dataset, provenance_of
-    from lerobot_unimask.modeling_unimask import UniMASKPolicy
+    from lerobot_unimask.data.episodes import first_windows, provenance_of
     from lerobot_unimask.paper.questions import ask_everything, summary
-    from lerobot_unimask.records import write_json
 
-    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
-    dataset = open_dataset(policy.config, arguments.root, arguments.repo_id)
+    policy, dataset = open_both(arguments)
     expert = provenance_of(Path(dataset.root)).get("expert", "paper")
     settings = {"each": arguments.each, "samples": arguments.samples, "seed": arguments.seed, "expert": expert}
     record = ask_everything(policy, first_windows(dataset), **settings)
     record["policy"] = policy.describe_origin()
     record["training"] = training_settings(policy.folder)
     print(summary(record))
-    if arguments.output:
-        write_json(arguments.output, {**record, "command": arguments.text})
+    write_record(arguments, record)
 
 
 def _tables(arguments: argparse.Namespace) -> None:
@@ -221,19 +222,19 @@ def _gallery(arguments: argparse.Namespace) -> None:
         raise ValueError("--maze.path and --maze.root go together: give both or neither.")
     from itertools import chain
 
-    from lerobot_unimask.data.episodes import first_windows, middle_windows, open_dataset, provenance_of
+    from lerobot_unimask.data.episodes import bounds_of, first_windows, open_dataset, provenance_of, read_windows
     from lerobot_unimask.data.factors import STATE
     from lerobot_unimask.envs.maze2d.record import mazes_of
     from lerobot_unimask.modeling_unimask import UniMASKPolicy
     from lerobot_unimask.paper.gallery import doorkey_pictures, maze_pictures, write_gallery
 
-    policy = UniMASKPolicy.from_pretrained(arguments.path, revision=arguments.revision)
-    batch = first_windows(open_dataset(policy.config, arguments.root, arguments.repo_id))
-    pictures = doorkey_pictures(policy, batch)
+    policy, dataset = open_both(arguments)
+    pictures = doorkey_pictures(policy, first_windows(dataset))
     if arguments.maze_path is not None:
         maze = UniMASKPolicy.from_pretrained(arguments.maze_path)
         dataset = open_dataset(maze.config, arguments.maze_root)
+        middles = [(first + end) // 2 for first, end in bounds_of(dataset)[:200]]
         starts, walls = first_windows(dataset)[STATE][:, 0], mazes_of(provenance_of(Path(dataset.root)))[0]
-        pictures = chain(pictures, maze_pictures(maze, middle_windows(dataset), starts, walls=walls))
+        pictures = chain(pictures, maze_pictures(maze, read_windows(dataset, middles), starts, walls=walls))
     for path in write_gallery(pictures, arguments.output, command=arguments.text):
         print(path)

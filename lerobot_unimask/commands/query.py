@@ -74,13 +74,13 @@ def _run(arguments: argparse.Namespace) -> None:
         source = query.Source(Path(dataset.root), arguments.root, arguments.repo_id, arguments.episode, start)
     if arguments.sample:
         sampling = query.Sampling(arguments.sample, arguments.order or "forward", arguments.seed or 0, arguments.check)
-    question = {"t": arguments.t, "given": arguments.given, "sampling": sampling, "exact": arguments.exact}
-    reply = query.ask(policy, arguments.mask, batch=batch, source=source, **question)
-    result = query.record(policy, arguments.mask, reply, source=source, **question)
+    how = {"t": arguments.t, "given": arguments.given, "sampling": sampling, "exact": arguments.exact}
+    reply = query.ask(policy, arguments.mask, batch=batch, source=source, **how)
+    result = query.record(policy, reply)
     print(json.dumps(result, indent=2) if arguments.json else query.describe(result))
     if arguments.plot:
         arguments.plot.parent.mkdir(parents=True, exist_ok=True)
-        query.picture(policy, arguments.mask, reply, source=source).savefig(arguments.plot, dpi=200)
+        query.picture(policy, reply).savefig(arguments.plot, dpi=200)
         print(f"drawn into {arguments.plot}", file=sys.stderr if arguments.json else sys.stdout)
 
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags
+from lerobot_unimask.commands.flags import add_command, dataset_flags, output_flag, policy_flags, write_record
 
 
 def add(commands: Any) -> None:
@@ -26,14 +26,12 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.plots.reliability import reliability
-    from lerobot_unimask.records import write_json
     from lerobot_unimask.validation import summary, validate
 
     record = validate(
         arguments.path, arguments.root, arguments.repo_id, exact=arguments.exact, revision=arguments.revision
     )
     print(summary(record))
-    if arguments.output:
-        write_json(arguments.output, {**record, "command": arguments.text})
+    write_record(arguments, record)
     if arguments.plot:
         reliability(record).savefig(arguments.plot, dpi=150)

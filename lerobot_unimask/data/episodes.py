@@ -178,11 +178,6 @@ def first_windows(dataset: LeRobotDataset) -> dict[str, Tensor]:
     return read_windows(dataset, [first for first, _ in bounds_of(dataset)])
 
 
-def middle_windows(dataset: LeRobotDataset, most: int = 200) -> dict[str, Tensor]:
-    """The windows in the middle of the first episodes, as a LeRobot batch."""
-    return read_windows(dataset, [(first + end) // 2 for first, end in bounds_of(dataset)[:most]])
-
-
 def episode_numbers(text: str, count: int) -> list[int]:
     """The episodes that a text names, `0:50` or `3,5,7`, of a dataset of `count`.
 

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
-from lerobot_unimask.networks.layers import Block, Cache, Dropout, FactorEmbedding, Heads, Predictions
+from lerobot_unimask.networks.layers import Block, Cache, Dropout, Heads, Predictions, make_embeddings
 
 # Rows of the timestep embedding, as in the original: an episode's steps, or thousandths of a longer one
 TIMESTEPS = 1000
@@ -33,43 +34,30 @@ class DecisionTransformer(nn.Module):
 
     Args:
         factors: what a step consists of; other properties than the return are not read.
-        fine_inputs: encode continuous values as `NumberEncoding` does.
 
     Raises:
         ValueError: there is no return factor.
     """
 
-    def __init__(
-        self,
-        factors: dict[str, Factor],
-        *,
-        context_length: int,
-        fine_inputs: bool,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward_width: int,
-        dropout: float,
-    ):
+    def __init__(self, config: UniMASKConfig, factors: dict[str, Factor]):
         super().__init__()
+        width, tokens = config.width, 3 * config.context_length
         if "rtg" not in factors:
             raise ValueError(
                 "network=decision_transformer reads a return at every step, and this dataset has no "
                 "'observation.return_to_go'; network=transformer with attention=causal needs none."
             )
-        self.embeddings = nn.ModuleDict(
-            {name: FactorEmbedding(factors[name], width, fine_inputs=fine_inputs) for name in ASKABLE}
-        )
+        self.embeddings = make_embeddings(config, {name: factors[name] for name in ASKABLE})
         self.returns = nn.Linear(1, width)
         self.hidden_return = nn.Parameter(0.02 * torch.randn(width))
         self.timesteps = nn.Embedding(TIMESTEPS + 1, width)
         nn.init.normal_(self.timesteps.weight, std=0.02)
         self.norm_inputs = nn.LayerNorm(width)
-        self.dropout = Dropout(dropout)
-        self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
+        self.dropout = Dropout(config.dropout)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width)
         self.heads = Heads(factors, ASKABLE, width)
-        before = torch.ones(3 * context_length, 3 * context_length, dtype=torch.bool).tril()
+        before = torch.ones(tokens, tokens, dtype=torch.bool).tril()
         self.register_buffer("before", before, persistent=False)
 
     def forward(

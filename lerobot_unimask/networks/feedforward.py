@@ -3,16 +3,16 @@
 Legend of shapes: B windows, K steps, N tokens, W width, H inner width.
 """
 
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
+from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
-from lerobot_unimask.networks.layers import Cache, Dropout, FactorEmbedding, Heads, Predictions
+from lerobot_unimask.networks.layers import Cache, Dropout, Heads, Predictions, make_embeddings
 
 
 class FeedForward(nn.Module):
@@ -25,38 +25,19 @@ class FeedForward(nn.Module):
 
     Args:
         factors: parts of a step. Every factor is read.
-        predicted: names of those that are predicted.
-        fine_inputs: whether `NumberEncoding` encodes continuous values.
-        width: size of each token's embedding.
-        depth: number of hidden layers.
-        feedforward_width: size of each hidden layer.
     """
 
-    def __init__(
-        self,
-        factors: dict[str, Factor],
-        *,
-        predicted: Sequence[str] = ASKABLE,
-        context_length: int,
-        fine_inputs: bool,
-        width: int,
-        depth: int,
-        feedforward_width: int,
-        dropout: float,
-    ):
+    def __init__(self, config: UniMASKConfig, factors: dict[str, Factor]):
         super().__init__()
-        self.embeddings = nn.ModuleDict(
-            {name: FactorEmbedding(factor, width, fine_inputs=fine_inputs) for name, factor in factors.items()}
-        )
-        tokens = sum(context_length if name in ASKABLE else 1 for name in factors)
-        widths = [tokens * width] + depth * [feedforward_width]
-        self.hidden = nn.Sequential(
-            *(
-                nn.Sequential(nn.Linear(before, after), nn.GELU(), Dropout(dropout))
-                for before, after in pairwise(widths)
-            )
-        )
-        self.heads = Heads(factors, predicted, feedforward_width, steps=context_length)
+        K, inner = config.context_length, config.feedforward_width
+        self.embeddings = make_embeddings(config, factors)
+        tokens = sum(K if name in ASKABLE else 1 for name in factors)
+        layers = [
+            nn.Sequential(nn.Linear(before, after), nn.GELU(), Dropout(config.dropout))
+            for before, after in pairwise([tokens * config.width] + config.depth * [inner])
+        ]
+        self.hidden = nn.Sequential(*layers)
+        self.heads = Heads(factors, config.predicted(factors), inner, steps=K)
 
     def forward(
         self,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_unimask.configuration_unimask import UniMASKConfig
 from lerobot_unimask.data.factors import Factor, Output
 from lerobot_unimask.language.masks import ASKABLE, Mask
 
@@ -107,13 +108,13 @@ def _extrapolate(value: Tensor, last: Tensor) -> Tensor:
 class FactorEmbedding(nn.Module):
     """One factor's tokens. Hidden is learned, not zero: zero is a legal action and a legal position."""
 
-    def __init__(self, factor: Factor, width: int, *, fine_inputs: bool):
+    def __init__(self, factor: Factor, width: int, *, fine: bool):
         super().__init__()
         self.discrete = {c.dims.start: c.categories for c in factor.components if c.categories is not None}
         self.continuous = [c.dims for c in factor.components if not c.discrete]
         self.categories = nn.ModuleList(nn.Embedding(count, width) for count in self.discrete.values())
         if self.continuous:
-            self.encoding = NumberEncoding(sum(d.stop - d.start for d in self.continuous), fine=fine_inputs)
+            self.encoding = NumberEncoding(sum(d.stop - d.start for d in self.continuous), fine=fine)
             self.numbers = nn.Linear(self.encoding.size, width)
         # Small, or in a stacked token what is hidden would drown what is shown, and learning takes twice as long.
         self.hidden = nn.Parameter(0.02 * torch.randn(width))
@@ -128,6 +129,12 @@ class FactorEmbedding(nn.Module):
             numbers = torch.cat([value[..., dims] for dims in self.continuous], dim=-1)
             parts.append(self.numbers(self.encoding(numbers, shown)))
         return torch.where(here, torch.stack(parts).sum(0), self.hidden)
+
+
+def make_embeddings(config: UniMASKConfig, factors: Mapping[str, Factor]) -> nn.ModuleDict:
+    """An embedding of each factor."""
+    fine = config.fine_inputs is not False
+    return nn.ModuleDict({name: FactorEmbedding(factor, config.width, fine=fine) for name, factor in factors.items()})
 
 
 class Dropout(nn.Dropout):
@@ -258,16 +265,17 @@ class Cache:
 class Block(nn.Module):
     """Self-attention, then a feed-forward network, each behind a layer norm."""
 
-    def __init__(self, width: int, heads: int, feedforward_width: int, dropout: float):
+    def __init__(self, config: UniMASKConfig):
         super().__init__()
-        self.heads = heads
-        self.dropout = Dropout(dropout)
+        width, inner = config.width, config.feedforward_width
+        self.heads = config.heads
+        self.dropout = Dropout(config.dropout)
         self.norm_attention = nn.LayerNorm(width)
         self.query_key_value = nn.Linear(width, 3 * width)
         self.project = nn.Linear(width, width)
         self.norm_feedforward = nn.LayerNorm(width)
         self.feedforward = nn.Sequential(
-            nn.Linear(width, feedforward_width), nn.GELU(), nn.Linear(feedforward_width, width), Dropout(dropout)
+            nn.Linear(width, inner), nn.GELU(), nn.Linear(inner, width), Dropout(config.dropout)
         )
 
     def forward(

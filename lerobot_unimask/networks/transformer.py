@@ -7,25 +7,26 @@ it and those before it, so that one pass answers for every step of a window.
 Legend of shapes: B windows, K steps, F factors, N tokens, D the dimensions of a factor, W width, H heads.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import Camera, Factor
+from lerobot_unimask.configuration_unimask import UniMASKConfig
+from lerobot_unimask.data.factors import Factor
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
 from lerobot_unimask.networks.layers import (
     Block,
     Cache,
     Dropout,
-    FactorEmbedding,
     Heads,
     Predictions,
     _before_or_here,
     course,
+    make_embeddings,
 )
 from lerobot_unimask.networks.vision import CameraEmbedding
 
@@ -34,55 +35,35 @@ class Transformer(nn.Module):
     """(window, shown) -> predictions.
 
     Args:
-        factors: what a step consists of. Every factor is read.
-        predicted: names of those that are predicted: `s`, `a`, and properties, those in both directions alone.
-        cameras: those whose pictures a step has.
-        backbone: arguments of each camera's `CameraEncoder`.
-        stacked: one token per step, made of all its factors (paper, appendix "Input stacking"), which cannot attend
-            causally; otherwise one token for each property, at the front, and one for each state, picture and action,
-            in the order of time.
-        residuals: whether to predict continuous states as departures from their `course`.
-        fine_inputs: whether to read continuous values as `NumberEncoding` does.
+        config: settings. With token_layout=stacked a step is one token, made of all its factors (paper, appendix "Input
+            stacking"), which cannot attend causally; otherwise there is one for each property, at the front, and one
+            for each state, picture and action, in the order of time.
+        factors: what a step consists of. Every factor is read; properties are predicted in both directions only.
+        load_backbone: whether pretrained weights of what looks at pictures are fetched.
     """
 
-    def __init__(
-        self,
-        factors: dict[str, Factor],
-        *,
-        predicted: Sequence[str] = ASKABLE,
-        context_length: int,
-        stacked: bool,
-        residuals: bool,
-        fine_inputs: bool,
-        width: int,
-        depth: int,
-        heads: int,
-        feedforward_width: int,
-        dropout: float,
-        cameras: Mapping[str, Camera] | None = None,
-        backbone: Mapping[str, Any] | None = None,
-    ):
+    def __init__(self, config: UniMASKConfig, factors: dict[str, Factor], *, load_backbone: bool = True):
         super().__init__()
-        cameras = cameras or {}
-        self.stacked = stacked
+        width, cameras = config.width, config.pictures
+        self.stacked = config.token_layout == "stacked"
         self.order = ("s", *cameras, "a")  # of a step's tokens
         self.properties = [name for name in factors if name not in ASKABLE]
-        self.embeddings = nn.ModuleDict(
-            {name: FactorEmbedding(factor, width, fine_inputs=fine_inputs) for name, factor in factors.items()}
-        )
-        if stacked:
+        self.embeddings = make_embeddings(config, factors)
+        tokens = len(self.properties) + len(self.order) * config.context_length
+        if self.stacked:
             self.stack = nn.Linear((len(factors) + len(cameras)) * width, width)
-        tokens = context_length if stacked else len(self.properties) + len(self.order) * context_length
+            tokens = config.context_length
         self.positions = nn.Parameter(0.02 * torch.randn(tokens, width))  # within the window, not the episode
-        self.dropout = Dropout(dropout)
-        self.blocks = nn.ModuleList(Block(width, heads, feedforward_width, dropout) for _ in range(depth))
+        self.dropout = Dropout(config.dropout)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width)
-        self.on_course = {
-            i: output for i, output in enumerate(factors["s"].outputs) if residuals and not output.discrete
-        }
-        self.heads = Heads(factors, predicted, width)
+        outputs = enumerate(factors["s"].outputs) if config.state_residuals else ()
+        self.on_course = {i: output for i, output in outputs if not output.discrete}
+        self.heads = Heads(factors, config.predicted(factors), width)
+        weights = config.pretrained_backbone_weights
+        backbone: dict[str, Any] = {"backbone": config.vision_backbone, "weights": weights, "load": load_backbone}
         self.cameras = nn.ModuleDict(
-            {name: CameraEmbedding(camera.shape, width, **(backbone or {})) for name, camera in cameras.items()}
+            {name: CameraEmbedding(camera.shape, width, **backbone) for name, camera in cameras.items()}
         )
 
     def forward(

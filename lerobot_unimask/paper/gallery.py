@@ -16,7 +16,6 @@ from lerobot_unimask.envs.doorkey.panels import (
     BACKWARDS_GIVEN,
     BACKWARDS_QUESTION,
     five_panels,
-    possible_steps,
     predicted_states,
 )
 from lerobot_unimask.envs.doorkey.pictures import draw_panels, state_distributions, trajectories
@@ -24,7 +23,14 @@ from lerobot_unimask.envs.doorkey.rules import GOAL, START_PAIRS, DynamicsCheck
 from lerobot_unimask.envs.maze2d.pictures import draw_ways, maze_trajectories
 from lerobot_unimask.language.masks import tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.paper.questions import CORNER, IMITATION, PROPERTY, PROPERTY_QUESTION, rollout
+from lerobot_unimask.paper.questions import (
+    CORNER,
+    IMITATION,
+    PROPERTY,
+    PROPERTY_QUESTION,
+    possible_steps,
+    rollout,
+)
 from lerobot_unimask.plots.answers import distributions, marginals, mask_diagram
 
 DOTS_PER_INCH = 180

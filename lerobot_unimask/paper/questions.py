@@ -19,7 +19,7 @@ from lerobot_unimask.asking.given import Given
 from lerobot_unimask.asking.sampling import Check, Samples
 from lerobot_unimask.data.factors import RETURN_SO_FAR, STATE
 from lerobot_unimask.envs.doorkey.expert import Expert, expert_probabilities
-from lerobot_unimask.envs.doorkey.panels import BACKWARDS_QUESTION, START, possible_steps
+from lerobot_unimask.envs.doorkey.panels import BACKWARDS_QUESTION, START
 from lerobot_unimask.envs.doorkey.rules import ACTIONS, CELLS, HORIZON, START_PAIRS, DynamicsCheck, reward, step
 from lerobot_unimask.language.masks import RANDOM_MASK, TASKS, Mask
 from lerobot_unimask.language.training_masks import TrainingMasks
@@ -54,6 +54,24 @@ class Outcomes:
     final: np.ndarray
     returns: np.ndarray
     visits: np.ndarray
+
+
+def possible_steps(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Whether each state follows from the one before by the action between them.
+
+    An open door needs no key, but it takes the key to open it, and a key once taken is carried on: the two cells of a
+    state decide every step.
+
+    Args:
+        states: (N, T, 2) agent and key cells.
+        actions: (N, T - 1).
+
+    Returns:
+        (N, T - 1) bool.
+    """
+    agent, key = states[..., 0], states[..., 1]
+    next_agent, next_key, _ = step(agent[:, :-1], key[:, :-1], np.array(False), actions)
+    return (next_agent == agent[:, 1:]) & (next_key == key[:, 1:])
 
 
 def expert_outcomes(starts: np.ndarray = START_PAIRS, expert: Expert = "paper") -> Outcomes:

@@ -22,7 +22,7 @@ from lerobot_unimask.language.masks import ASKABLE, RANDOM_MASK
 from lerobot_unimask.language.training_masks import validation_masks
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 from lerobot_unimask.networks.layers import by_component
-from lerobot_unimask.networks.losses import masked_losses
+from lerobot_unimask.objective import masked_losses
 
 
 @torch.no_grad()

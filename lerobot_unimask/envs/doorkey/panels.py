@@ -19,7 +19,7 @@ from lerobot_unimask.asking.sampling import RejectionError
 from lerobot_unimask.data.factors import RETURN_SO_FAR, STATE
 from lerobot_unimask.envs.doorkey.environment import DoorKeyEnv
 from lerobot_unimask.envs.doorkey.episodes import Episodes
-from lerobot_unimask.envs.doorkey.rules import DOOR, GOAL, HORIZON, DynamicsCheck, cell_at, step
+from lerobot_unimask.envs.doorkey.rules import DOOR, GOAL, HORIZON, DynamicsCheck, cell_at
 from lerobot_unimask.language.masks import parse_token
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
@@ -218,24 +218,6 @@ def rollout(
     policy.reset()
     agent, key = np.moveaxis(np.stack(states, axis=1), -1, 0)  # (N, K + 1) each
     return Episodes(agent, key, np.stack(doors, axis=1), np.stack(actions, axis=1), np.stack(rewards, axis=1))
-
-
-def possible_steps(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Whether each state follows from the one before by the action between them.
-
-    An open door needs no key, but it takes the key to open it, and a key once taken is carried on: the two cells of a
-    state decide every step.
-
-    Args:
-        states: (N, T, 2) agent and key cells.
-        actions: (N, T - 1).
-
-    Returns:
-        (N, T - 1) bool.
-    """
-    agent, key = states[..., 0], states[..., 1]
-    next_agent, next_key, _ = step(agent[:, :-1], key[:, :-1], np.array(False), actions)
-    return (next_agent == agent[:, 1:]) & (next_key == key[:, 1:])
 
 
 def given_states(given: Given, context_length: int) -> dict[str, tuple[int, Sequence[int]]]:
