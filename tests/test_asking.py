@@ -83,7 +83,7 @@ def test_a_question_without_a_window(tiny_policy, doorkey_batch):
     batch["observation.state"][:, -1] = torch.tensor([15, 15])
     batch["observation.return_to_go"][:, 0] = 2
     assert_same_answers(policy.infer(batch, "s[1:-1], a[:] | s[0], s[-1], rtg[0]"), answer)
-    with pytest.raises(ValueError, match=r"shows s\[-1\]|shows s\[9\]"):
+    with pytest.raises(ValueError, match=r"s\[-1\]|s\[9\]"):
         policy.infer(None, "s[1:-1] | s[0], s[-1]", given={"s[0]": [0, 9]})
 
 
@@ -97,7 +97,7 @@ def test_given_values_replace_recorded_ones_in_a_question(tiny_policy, doorkey_b
     before = copy.deepcopy(doorkey_batch)
     assert_same_answers(policy.infer(doorkey_batch, "s[1:9] | s[0], s[-1], a[0]", given=given), expected)
     assert_unchanged(doorkey_batch, before)
-    with pytest.raises(ValueError, match="key_cell is a category from 0 to 15"):
+    with pytest.raises(ValueError, match=r"key_cell.*15"):
         policy.infer(doorkey_batch, "s[1] | s[0]", given={"s[0]": [0, 16]})
 
 
@@ -219,9 +219,9 @@ def test_a_model_that_attends_causally_alone_refuses_what_it_has_not_learnt(tiny
     policy = tiny_policy(attention="causal", training_masks=["behavior_cloning", "reward_conditioned"])
     answer = policy.infer(doorkey_batch, "reward_conditioned", t=3)["a"][0].probabilities[:, 3]
     assert torch.equal(answer.isfinite().all(1), policy.make_window(doorkey_batch).valid[:, 3])
-    with pytest.raises(MaskError, match=r"attends causally alone\. It was trained on behavior_cloning, reward_conditi"):
+    with pytest.raises(MaskError, match="behavior_cloning, reward_conditi"):
         policy.infer(doorkey_batch, "goal_conditioned", t=3)
-    with pytest.raises(MaskError, match="trained on questions that ask for one token"):
+    with pytest.raises(MaskError, match="attention"):
         tiny_policy(attention="causal", training_masks="past")
 
 

@@ -211,5 +211,5 @@ def test_an_entry_of_info_json_that_cannot_be_is_named(doorkey_root, tmp_path, e
 def test_an_info_json_that_is_no_mapping_is_named(tmp_path, text):
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text(text)
-    with pytest.raises(ValueError, match=r"info.json (holds a|cannot be read)"):
+    with pytest.raises(ValueError, match=r"info\.json"):
         check_folder(tmp_path)

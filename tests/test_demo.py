@@ -111,7 +111,7 @@ def test_a_place_that_is_taken_is_refused_and_left_as_it_was(tmp_path, kind, cap
 
 def test_a_command_that_fails_ends_the_demo_and_its_log_says_why(tmp_path):
     log = tmp_path / "eval.log"
-    with pytest.raises(ChildProcessError, match=rf"lerobot-eval failed, with status \d+; {log}"):
+    with pytest.raises(ChildProcessError, match=rf"lerobot-eval.*{log}"):
         demo._run(log, "lerobot-eval", "--policy.path=nowhere", "--env.type=doorkey")
     assert "nowhere" in log.read_text()
 

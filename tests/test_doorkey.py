@@ -243,7 +243,7 @@ def test_actions_of_every_kind_are_understood(action):
 def test_other_actions_are_refused(action):
     env = DoorKeyEnv()
     env.reset()
-    with pytest.raises(ValueError, match="one number from 0 to 3"):
+    with pytest.raises(ValueError, match="0 to 3"):
         env.step(action)
 
 
@@ -413,8 +413,8 @@ def test_build_makes_a_dataset_that_lerobot_loads(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"episodes": 0}, "episodes must be at least 1"),
-        ({"episodes": 5, "seed": -1}, "seed at least 0"),
+        ({"episodes": 0}, "episodes.* 1"),
+        ({"episodes": 5, "seed": -1}, "seed.* 0"),
         ({"episodes": 5, "expert": "best"}, "'best'"),
         ({"episodes": 5, "beta": math.nan}, "finite"),
     ],

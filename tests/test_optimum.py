@@ -222,12 +222,12 @@ def test_an_answer_says_what_a_policys_does(recorded):
 def test_what_cannot_be_is_refused(recorded):
     impossible = window_of(np.full((3, 10, 2), [GOAL, 0]), np.zeros((3, 10), dtype=int), np.zeros(3))
     impossible.values["s"][:2] = recorded.values["s"][:2]
-    with pytest.raises(ValueError, match="window 2 shows cannot occur"):  # at the goal, and the key left behind
+    with pytest.raises(ValueError, match="window 2 "):  # at the goal, and the key left behind
         exact_answer(impossible, mask_of("a[:] | s[3]", B=3))
     far = window_of(np.zeros((1, 10, 2)), np.zeros((1, 10), dtype=int), np.array([100.0]))
-    with pytest.raises(ValueError, match="cannot occur"):
+    with pytest.raises(ValueError, match="window 0 "):
         exact_answer(far, mask_of("a[:] | rtg[0]", B=1))
-    with pytest.raises(ValueError, match="step 2, where these windows start"):
+    with pytest.raises(ValueError, match="step 2"):
         exact_answer(recorded, mask_of("a[:] | rtg[0]"), first_step=2)
     with pytest.raises(ValueError, match="first_step is 10"):
         Optimum(first_step=10)

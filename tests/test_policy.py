@@ -218,7 +218,7 @@ def test_without_a_return_column_there_is_no_return_factor(doorkey, tiny_policy,
     assert list(policy.factors) == ["s", "a"]
     batch = {key: value for key, value in doorkey_batch.items() if "return" not in key and key != "timestamp"}
     assert policy.forward(batch)[0].isfinite()
-    with pytest.raises(ValueError, match=r"target_return is 5.*no return factor"):
+    with pytest.raises(ValueError, match="target_return is 5"):
         tiny_policy(features=without_return(doorkey), target_return=5)
     for setting in ({"inference_mask": "reward_conditioned"}, {"training_masks": ["past", "reward_conditioned"]}):
         with pytest.raises(MaskError, match="no factor 'rtg'"):
@@ -240,7 +240,7 @@ def test_acting_needs_a_question_about_the_action_now(tiny_policy, mask):
     "observation", [{}, {"observation.state": torch.zeros(3, 4)}, {"observation.state": torch.zeros(2)}]
 )
 def test_other_observations_are_refused(tiny_policy, observation):
-    with pytest.raises(ValueError, match=r"observes 'observation\.state' with 2 numbers"):
+    with pytest.raises(ValueError, match=r"observation\.state.* 2 "):
         tiny_policy().select_action(observation)
 
 
@@ -253,5 +253,5 @@ def test_statistics_arrive_on_the_models_device(tiny_policy):
 
 
 def test_categories_that_the_data_exceed_are_refused(tiny_policy):
-    with pytest.raises(ValueError, match=r"observation\.state reaches \[16\.0, 3\.0\]"):
+    with pytest.raises(ValueError, match=r"observation\.state.*\[16\.0, 3\.0\]"):
         tiny_policy().statistics.fill({"observation.state": {"max": [16, 3]}})

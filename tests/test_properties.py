@@ -145,7 +145,7 @@ def test_a_checkpoint_of_format_3_answers_as_before_and_refuses_the_return(befor
     loaded = UniMASKPolicy.from_pretrained(folder)
     window, mask = random_question(policy, doorkey_batch, 0)
     assert_same_answers(loaded.infer(window, mask), policy.infer(window, mask))
-    with pytest.raises(MaskError, match="does not predict rtg"):
+    with pytest.raises(MaskError, match="rtg"):
         loaded.infer(doorkey_batch, "rtg[0] | s[0]")
 
 
@@ -171,7 +171,7 @@ def test_a_checkpoint_goes_on_with_questions_about_properties(properties, before
 @pytest.mark.parametrize("attention", ["causal", "bidirectional"])
 def test_training_on_what_is_not_predicted_is_refused(attention, tiny_policy):
     settings = {"ask_properties": False} if attention == "bidirectional" else {}
-    with pytest.raises(MaskError, match="does not predict rtg"):
+    with pytest.raises(MaskError, match="rtg"):
         tiny_policy(attention=attention, training_masks="rtg[0] | s[:t+1], a[:t+1]", **settings)
 
 

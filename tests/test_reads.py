@@ -134,7 +134,7 @@ def test_an_index_that_lerobot_refuses_is_refused(root):
     for outside in (len(dataset), -len(dataset) - 1):
         with pytest.raises(IndexError):
             dataset[outside]
-        with pytest.raises(IndexError, match=f"{outside} is out of bounds"):
+        with pytest.raises(IndexError, match=str(outside)):
             dataset.__getitems__([0, outside])
     with pytest.raises(TypeError):
         dataset.__getitems__([1.5])

@@ -173,7 +173,7 @@ def test_rows_of_different_lengths_are_named(root):
     rows = table.column("action").to_pylist()
     ragged = pa.array([*rows[:-1], rows[-1][:1]], pa.list_(pa.float32()))
     pq.write_table(table.set_column(table.column_names.index("action"), "action", ragged), path)
-    with pytest.raises(ValueError, match=r"action has rows of different lengths"):
+    with pytest.raises(ValueError, match="action"):
         policy_of(root)
 
 
