@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_PREFIX, OBS_STATE
@@ -21,9 +22,9 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_PREFI
 from dataset_builders.folders import refuse_existing, written_whole
 from dataset_builders.label import copy_rest, episode_files, flat_numbers, rewrite, stored_schema, with_statistics
 from dataset_builders.writer import EpisodeStatistics, as_cells, dataset_statistics, episode_statistics
-from lerobot_unimask.data.episodes import check_folder
+from lerobot_unimask.data.episodes import TASKS, check_age, check_folder, is_type, order_of_tasks
 from lerobot_unimask.data.factors import TEXTS, flat_names
-from lerobot_unimask.data.soundness import check_columns, check_statistics, data_files
+from lerobot_unimask.data.soundness import are_statistics, check_columns, check_statistics, data_files
 from lerobot_unimask.records import read_json, write_json
 
 PICTURES = ("image", "video")
@@ -42,8 +43,9 @@ class Plan:
         convert: whether to bring format v2.1 to v3.0.
         rename: old name -> new name.
         drop: columns to leave out.
-        flatten: columns of several dimensions that become rows.
+        flatten: columns of several dimensions, or of none, that become rows.
         plain: columns whose names are nested.
+        retype: columns whose type in info.json is none that a table has.
         categories: column -> number of categories, or `auto` to count them.
         statistics: columns, by their new names, whose statistics are absent.
         why: a line for each step.
@@ -54,6 +56,7 @@ class Plan:
     drop: list[str] = field(default_factory=list)
     flatten: list[str] = field(default_factory=list)
     plain: list[str] = field(default_factory=list)
+    retype: list[str] = field(default_factory=list)
     categories: dict[str, int | str] = field(default_factory=dict)
     statistics: list[str] = field(default_factory=list)
     why: list[str] = field(default_factory=list)
@@ -85,6 +88,9 @@ def make_plan(
     for key in (*asked, *(categories or {}), *(name for name in drop if name != "missing")):
         if key not in features and key not in asked.values():
             raise ValueError(f"{root} has no column {key!r}; it has {', '.join(features)}.")
+    check_age(root, info["codebase_version"])
+    if (root / TASKS).exists() and order_of_tasks(root) is not None:
+        plan.why.append(f"tasks: {TASKS} does not list their texts by number, from 0 on.")
     if not str(info.get("codebase_version", "")).startswith("v3"):
         plan.convert = True
         plan.why.append(f"convert: the format is {info.get('codebase_version')}, and LeRobot reads v3.0.")
@@ -111,9 +117,18 @@ def make_plan(
     stats = read_json(root / "meta" / "stats.json") if (root / "meta" / "stats.json").exists() else {}
     for old, entry in features.items():
         new = plan.rename.get(old, old)
-        if old in plan.drop or entry["dtype"] in (*PICTURES, *TEXTS):
+        if old in plan.drop:
             continue
-        if len(entry["shape"]) > 1:
+        if entry["dtype"] in (*PICTURES, *TEXTS):
+            if old in stats and not are_statistics(stats[old]):
+                plan.why.append(f"statistics of {new}: those in meta/stats.json are no numbers, and are left out.")
+            continue
+        if not is_type(entry["dtype"]):
+            plan.retype.append(old)
+            plan.why.append(
+                f"type of {new}: {entry['dtype']} in info.json, which no table has; that of the files instead."
+            )
+        if len(entry["shape"]) != 1:
             plan.flatten.append(old)
             plan.why.append(f"flatten {new}: it has shape {tuple(entry['shape'])}, and policies read rows of numbers.")
         names = entry.get("names")
@@ -131,6 +146,14 @@ def make_plan(
         if fault or old in plan.flatten:
             plan.statistics.append(new)
             plan.why.append(f"statistics of {new}: {fault or 'those in meta/stats.json have its old shape'}.")
+    left = {plan.rename.get(key, key) for key in features if key not in plan.drop}
+    if ACTION not in left:
+        plan.why.append(f"(not done) no column is called {ACTION}: --rename OLD={ACTION} gives one that name.")
+    if not left & {OBS_STATE, OBS_ENV_STATE}:
+        plan.why.append(
+            f"(not done) no column is called {OBS_STATE}: --rename OLD={OBS_STATE} gives one that name, or train with "
+            f"--policy.states and columns called {OBS_PREFIX}*."
+        )
     for key, count in (categories or {}).items():
         plan.categories[plan.rename.get(key, key)] = count if count == AUTO else int(count)
         plan.why.append(f"--categories {key}={count}.")
@@ -139,6 +162,8 @@ def make_plan(
 
 def _fault(known: Mapping[str, Any], size: int, is_read: bool) -> str | None:
     """What is wrong with a column's statistics."""
+    if not are_statistics(known):
+        return "those in meta/stats.json are no numbers"
     if not {"mean", "std"} <= known.keys():
         return "meta/stats.json lacks them"
     try:
@@ -213,13 +238,25 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
     info = read_json(source / "meta" / "info.json")
     old_features = {key: entry for key, entry in info["features"].items() if key not in plan.drop}
     columns = _read_numbers(source, old_features, plan)
+    kinds = pq.read_schema(data_files(source)[0])
+    for old in plan.retype:
+        old_features[old] = {**old_features[old], "dtype": _dtype(kinds.field(old).type)}
     features = {plan.rename.get(old, old): _entry(old, entry, plan, columns) for old, entry in old_features.items()}
     stored = stored_schema(features)
     new_names = {old: plan.rename.get(old, old) for old in old_features}
 
+    numbers = order_of_tasks(source)
+    if numbers:
+        texts = pd.DataFrame({"task_index": range(len(numbers))}, index=pd.Index(numbers.values(), name="task"))
+        (partial / TASKS).unlink()  # a link, it may be
+        texts.to_parquet(partial / TASKS)
+
     def with_columns(table: pa.Table) -> pa.Table:
         arrays = {new: table.column(old) for old, new in new_names.items() if old in table.column_names}
         fields = [stored.field(new) for new in arrays]
+        if numbers:
+            renumbered = np.searchsorted(list(numbers), arrays["task_index"].to_numpy())
+            arrays["task_index"] = pa.chunked_array([renumbered])
         cells = [_as_stored(arrays[f.name], f.type, features[f.name]["shape"]) for f in fields]
         return pa.table(cells, schema=pa.schema(fields, metadata=stored.metadata))
 
@@ -234,9 +271,8 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
     for path in episode_files(source):
         rewrite(path, partial / path.relative_to(source), lambda table: _episodes_table(table, plan, found))
     path = source / "meta" / "stats.json"
-    stats = {
-        plan.rename.get(k, k): v for k, v in (read_json(path) if path.exists() else {}).items() if k not in plan.drop
-    }
+    old_stats = read_json(path) if path.exists() else {}
+    stats = {plan.rename.get(k, k): v for k, v in old_stats.items() if k not in plan.drop and are_statistics(v)}
     for key, statistics in found.items():
         stats[key] = {name: value.tolist() for name, value in dataset_statistics(statistics).items()}
     write_json(partial / "meta" / "stats.json", stats, say=False)
@@ -253,6 +289,13 @@ def _read_numbers(source: Path, features: Mapping[str, Mapping[str, Any]], plan:
             parts = [flat_numbers(pq.read_table(path, columns=[old]).column(old)) for path in data_files(source)]
             columns[new] = np.concatenate(parts).reshape(sum(_lengths(source)), -1)
     return columns
+
+
+def _dtype(kind: pa.DataType) -> str:
+    """The dtype of info.json for a column stored as (lists of) numbers of this kind."""
+    while isinstance(kind, pa.BaseExtensionType) or pa.types.is_nested(kind):
+        kind = kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind.value_type
+    return str(np.dtype(kind.to_pandas_dtype()))
 
 
 def _entry(old: str, entry: dict[str, Any], plan: Plan, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:

@@ -398,7 +398,7 @@ def test_of_two_pushes_at_once_one_is_there_and_the_other_is_told(checkpoint):
         for thread in threads:
             thread.join()
     (lost,) = [number for number in range(2) if ended[number] is not None]
-    assert "me/" in str(ended[lost])
+    assert "me/both" in str(ended[lost])
     for winner in (1 - lost, lost):
         pulled = UniMASKPolicy.from_pretrained("me/both")
         assert (pulled.config.mask_seed, int(pulled.updates)) == (100 + winner, 100 + winner)

@@ -221,7 +221,7 @@ def test_a_model_that_attends_causally_alone_refuses_what_it_has_not_learnt(tiny
     assert torch.equal(answer.isfinite().all(1), policy.make_window(doorkey_batch).valid[:, 3])
     with pytest.raises(MaskError, match="behavior_cloning, reward_conditi"):
         policy.infer(doorkey_batch, "goal_conditioned", t=3)
-    with pytest.raises(MaskError, match="attention"):
+    with pytest.raises(MaskError, match="behavior_cloning"):
         tiny_policy(attention="causal", training_masks="past")
 
 

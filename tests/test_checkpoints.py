@@ -159,10 +159,10 @@ def test_a_truncated_or_absent_file_is_refused(tiny_policy, tmp_path):
     content = file.read_bytes()
     for length in (len(content) - 100, 20, 0):
         file.write_bytes(content[:length])
-        with pytest.raises(ValueError, match=r"model\.safetensors cannot be read"):
+        with pytest.raises(ValueError, match=r"model\.safetensors"):
             UniMASKPolicy.from_pretrained(tmp_path)
     file.unlink()
-    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read"):
+    with pytest.raises(ValueError, match=r"model\.safetensors"):
         UniMASKPolicy.from_pretrained(tmp_path)
 
 

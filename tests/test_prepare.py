@@ -2,9 +2,11 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 
 import commands
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -17,7 +19,7 @@ from policies import SMALL_FLAGS
 
 from dataset_builders.prepare import make_plan, prepare
 from lerobot_unimask import UniMASKConfig, UniMASKPolicy, cli, query
-from lerobot_unimask.data.episodes import open_dataset, read_window
+from lerobot_unimask.data.episodes import check_format, open_dataset, read_window
 from lerobot_unimask.data.factors import flat_names
 from lerobot_unimask.records import read_json
 
@@ -233,16 +235,93 @@ def test_statistics_are_those_of_the_numbers(renamed, tmp_path):
     np.testing.assert_allclose(stats["std"], values.std(0), atol=1e-6)
 
 
-def test_statistics_that_are_unsound_are_computed(blind, tmp_path):
+@pytest.mark.parametrize(
+    ("fault", "refused"),
+    [
+        ({"std": [float("nan"), 1.0]}, False),  # where it is read, and not before
+        ({"mode": "no number"}, True),
+        ({"q01": [[0.0], [0.0, 1.0]]}, True),
+        ({"count": None}, True),
+        (None, True),
+    ],
+)
+def test_statistics_that_are_unsound_are_computed(blind, tmp_path, fault, refused):
     copy = shutil.copytree(blind, tmp_path / "data")
     path = copy / "meta" / "stats.json"
     stats = json.loads(path.read_text())
-    path.write_text(json.dumps({**stats, "action": {**stats["action"], "std": [float("nan"), 1.0]}}))
+    path.write_text(json.dumps({**stats, "action": fault and {**stats["action"], **fault}, "episode_index": {}}))
+    with pytest.raises(ValueError, match=r"action.*unimask prepare") if refused else nullcontext():
+        check_format(copy)
     plan = make_plan(copy)
-    assert plan.statistics == ["action"]
+    assert plan.statistics == ["action", "episode_index"]
     made = prepare(copy, plan, output=tmp_path / "made")
+    check_format(made)
     again = json.loads((made / "meta" / "stats.json").read_text())["action"]
     np.testing.assert_allclose(again["std"], stats["action"]["std"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("entry", [{"dtype": "bfloat16"}, {"shape": []}, {"shape": [1] * 6}])
+def test_a_column_that_lerobot_has_no_type_for_becomes_numbers_as_they_are_stored(blind, tmp_path, entry):
+    copy = shutil.copytree(blind, tmp_path / "data")
+    info = read_json(copy / "meta" / "info.json")
+    size = int(np.prod(entry.get("shape", [2])))
+    info["features"]["extra"] = {**info["features"]["action"], "names": None, "shape": [size], **entry}
+    (copy / "meta" / "info.json").write_text(json.dumps(info))
+    for path in (copy / "data").glob("*/*.parquet"):
+        table = pq.read_table(path).replace_schema_metadata(None)
+        column = table["action"] if size == 2 else pa.compute.list_element(table["action"], 0)
+        pq.write_table(table.append_column("extra", column), path)
+    with pytest.raises(ValueError, match=r"extra.*unimask prepare"):
+        check_format(copy)
+    made = prepare(copy, make_plan(copy), output=tmp_path / "made")
+    item = LeRobotDataset("me/robot", root=made)[20]
+    assert item["extra"].dtype == torch.float32
+    assert torch.equal(item["extra"].reshape(-1), item["action"][:size])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tasks: tasks.reset_index(),
+        lambda tasks: tasks.reset_index().rename_axis("number"),
+        lambda tasks: tasks.iloc[::-1],
+        lambda tasks: tasks.assign(task_index=[3, 7]),
+    ],
+    ids=["texts in a column", "the same, named", "in another order", "numbers that are not there"],
+)
+def test_texts_of_tasks_get_the_places_where_lerobot_looks_for_them(pictured, tmp_path, change):
+    copy = shutil.copytree(pictured, tmp_path / "data")
+    tasks = pd.read_parquet(copy / "meta" / "tasks.parquet")
+    changed = change(tasks)
+    changed.to_parquet(copy / "meta" / "tasks.parquet")
+    numbers = dict(zip(tasks["task_index"], sorted(changed["task_index"]), strict=True))
+    for path in (copy / "data").glob("*/*.parquet"):
+        table = pq.read_table(path)
+        at = table.column_names.index("task_index")
+        stored = pa.array([numbers[number] for number in table["task_index"].to_pylist()])
+        pq.write_table(table.set_column(at, "task_index", stored), path)
+    with pytest.raises(ValueError, match=r"tasks\.parquet.*unimask prepare"):
+        check_format(copy)
+    made = prepare(copy, make_plan(copy), output=tmp_path / "made")
+    check_format(made)
+    dataset = LeRobotDataset("me/robot", root=made)
+    assert [dataset[sum(LENGTHS[:episode])]["task"] for episode in range(3)] == ["wave 0", "wave 1", "wave 0"]
+
+
+@pytest.mark.parametrize("version", ["v1.6", "v2.0"])
+def test_a_format_that_lerobot_does_not_convert_is_named(blind, tmp_path, version):
+    copy = shutil.copytree(blind, tmp_path / "data")
+    info = read_json(copy / "meta" / "info.json")
+    (copy / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": version}))
+    for ask in (check_format, make_plan):
+        with pytest.raises(ValueError, match=version):
+            ask(copy)
+
+
+@pytest.mark.parametrize("gone", ["action", "observation.state"])
+def test_a_column_that_a_policy_needs_is_missed(blind, gone):
+    assert gone not in " ".join(make_plan(blind).why)
+    assert f"--rename OLD={gone}" in " ".join(make_plan(blind, drop=[gone]).why)
 
 
 @pytest.mark.parametrize(("given", "count"), [("auto", 3), ("5", 5)])

@@ -292,7 +292,7 @@ def test_the_share_of_causal_windows_is_as_asked_and_the_others_are_as_without()
 def test_without_a_causal_form_nothing_is_causal_or_the_mask_is_refused():
     _, mask = causal_masks("past", share=0.5)
     assert mask.causal is False
-    with pytest.raises(MaskError, match="attention"):
+    with pytest.raises(MaskError, match="behavior_cloning"):
         causal_masks(["behavior_cloning", "future"], share=1.0)
 
 

@@ -11,17 +11,23 @@ from string import Formatter
 from typing import Any, NoReturn
 
 import datasets
+import pandas as pd
+from datasets.features.features import string_to_arrow
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.reads import read_cameras
+from lerobot_unimask.data.soundness import are_statistics
 from lerobot_unimask.records import read_json
 
 MAX_FPS = 1_000_000
 MAX_COUNT = 10**12  # of episodes, frames, numbers: more is a damaged file
+TASKS = "meta/tasks.parquet"
+MAX_DIMENSIONS = 5  # of a number of LeRobot's columns
 LOCAL = "local/dataset"  # the name of a dataset that is read from a folder, where nobody gives it one
 
 
@@ -39,14 +45,69 @@ def check_folder(root: Path) -> None:
 def check_format(root: Path) -> None:
     """
     Raises:
-        ValueError: its info.json is damaged, or it is a dataset of a format that LeRobot no longer reads.
+        FileNotFoundError: it has no texts of tasks.
+        ValueError: its info.json, stats.json or tasks are damaged, or its format is one that LeRobot no longer reads.
     """
-    version = read_info(root)["codebase_version"]
-    if version.startswith("v2"):
+    info = read_info(root)
+    version = info["codebase_version"]
+    if version.startswith("v2.1"):
         raise ValueError(
             f"{root} has LeRobot's format {version}, and LeRobot reads v3.0: `unimask prepare --dataset.root={root} "
             "--output=DIR` writes it anew."
         )
+    check_age(root, version)
+    if not (root / TASKS).exists():
+        raise FileNotFoundError(f"{root} lacks {TASKS}, the texts of its tasks: part of the dataset has not arrived.")
+    if order_of_tasks(root) is not None:
+        raise ValueError(
+            f"{root / TASKS} does not list the texts of task_index 0, 1, 2 and so on, in this order, and LeRobot would "
+            f"take one for another: `unimask prepare --dataset.root={root} --output=DIR` puts them in order."
+        )
+    for key, entry in info["features"].items():
+        if not is_type(entry["dtype"]) or not 1 <= len(entry["shape"]) <= MAX_DIMENSIONS:
+            raise ValueError(
+                f"{root / 'meta' / 'info.json'} gives {key} the dtype {entry['dtype']!r} and the shape "
+                f"{entry['shape']}, which LeRobot has no column for: `unimask prepare --dataset.root={root} "
+                "--output=DIR` makes it one of numbers as they are stored."
+            )
+    path = root / "meta" / "stats.json"
+    for key, known in (read_json(path) if path.exists() else {}).items():
+        if not are_statistics(known):
+            raise ValueError(
+                f"{path} holds for {key} what are no statistics, {str(known)[:80]}: `unimask prepare "
+                f"--dataset.root={root} --output=DIR` leaves them out, or recomputes them."
+            )
+
+
+def check_age(root: Path, version: str) -> None:
+    """
+    Raises:
+        ValueError: a format before the one that LeRobot converts.
+    """
+    if version.startswith(("v1", "v2.0")):
+        raise ValueError(
+            f"{root} has LeRobot's format {version}; LeRobot reads v3.0 and converts v2.1. LeRobot 0.3 brings it there "
+            "with python -m lerobot.datasets.v21.convert_dataset_v20_to_v21, which takes v2.0."
+        )
+
+
+def order_of_tasks(root: Path) -> dict[int, str] | None:
+    """task_index -> text, by rising numbers, as a dataset's table of tasks has them; None where the table is as LeRobot
+    reads it: its index are the texts, and the n-th row has number n."""
+    table = pd.read_parquet(root / TASKS)
+    texts = table.get("task", table.index)
+    numbers = table["task_index"].tolist()
+    if "task" not in table and numbers == list(range(len(numbers))) and all(isinstance(text, str) for text in texts):
+        return None
+    return dict(sorted(zip(numbers, map(str, texts), strict=True)))
+
+
+def is_type(dtype: str) -> bool:
+    """Whether a column of info.json can have this dtype."""
+    try:
+        return dtype in ("image", "video", *TEXTS) or bool(string_to_arrow(dtype))
+    except ValueError:
+        return False
 
 
 def check_home() -> None:
@@ -91,6 +152,8 @@ def read_info(root: Path) -> dict[str, Any]:
             refuse(f"features.{key}", feature, "a mapping with a dtype and a shape, a list of sizes from 1 on")
         if not isinstance(feature.get("dtype"), str):
             refuse(f"features.{key}.dtype", feature.get("dtype"), "a text")
+        if feature["dtype"] in ("image", "video") and len(shape) != 3:
+            refuse(f"features.{key}.shape", shape, "a picture's height, width and channels, as in [480, 640, 1]")
     for entry in ("total_episodes", "total_frames"):
         if not _is_count(info.get(entry), 0, MAX_COUNT):
             refuse(entry, info.get(entry), f"a whole number from 0 to {MAX_COUNT}")

@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -78,7 +79,7 @@ def _numbers(
         ValueError: a column's rows have different lengths.
     """
     found = [key for key in keys if key in pq.read_schema(path).names]
-    table = pq.read_table(path, columns=[*found, "episode_index"], memory_map=True)
+    table = pq.read_table(path, columns=list({*found, "episode_index"}), memory_map=True)
     rows: np.ndarray = np.arange(len(table))
     if episodes is not None:
         rows = rows[np.isin(table.column("episode_index").to_numpy(), list(episodes))]
@@ -101,6 +102,14 @@ def _describe(path: Path, key: str, names: Sequence[str], bad: np.ndarray, value
         f"{place['frame_index']}, and {int(bad.sum()) - 1} more in this file that are not finite: mend the data, or "
         "leave these episodes out with --dataset.episodes or lerobot-edit-dataset, delete_episodes."
     )
+
+
+def are_statistics(known: Any) -> bool:
+    """Whether a column's entry in stats.json maps names to numbers, or (nested) lists of as many numbers each."""
+    try:
+        return isinstance(known, Mapping) and all(np.asarray(value).dtype.kind in "biuf" for value in known.values())
+    except ValueError:  # lists of different lengths
+        return False
 
 
 def check_statistics(key: str, names: Sequence[str], known: Mapping[str, ArrayLike]) -> None:
