@@ -5,9 +5,10 @@ memories of several lengths.
         --output=docs/results/FILE.json
 
 Trained as lerobot-train does, then rolled out from unseen starts, the same for every model and seed. Each run stands in
-the record as soon as it is done, and what stands there is not run again. A setting can be changed:
-`--settings='{"width": 256}'`. A dataset of several tasks makes one policy that is told the task. `--windows=2,5,10,20
---remember=1,2,3,5,10` trains a policy for each length of window and rolls it out with each memory that is shorter.
+the record as soon as it is done, and what stands there is not run again; nor is a policy trained that `--save` kept.
+A setting can be changed: `--settings='{"width": 256}'`. A dataset of several tasks makes one policy that is told the
+task. `--windows=2,5,10,20 --remember=1,2,3,5,10` trains a policy for each length of window and rolls it out with each
+memory that is shorter, too.
 """
 
 import argparse
@@ -21,7 +22,7 @@ import torch
 from arm import success
 
 import lerobot_policy_unimask  # noqa: F401 (registers)
-from lerobot_unimask import UniMASKConfig
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.data.episodes import provenance_of, read_info
 from lerobot_unimask.envs.metaworld.environment import OBJECT, MetaWorldEnv
 from lerobot_unimask.machine import describe_machine
@@ -29,25 +30,30 @@ from lerobot_unimask.records import read_json, versions, write_json
 from lerobot_unimask.training import Trainer
 
 KEPT = ("context_length", "n_obs_steps", "training_masks", "causal_share", "fine_inputs", "continuous_head", "dropout")
-
 DEFAULT = UniMASKConfig().context_length
 
 
-def policy_runs(root: Path, seed: int, K: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """One policy trained on a dataset, and its success on each of the dataset's tasks."""
-    settings = {"mask_seed": seed, **arguments.settings}
-    settings |= {} if K == DEFAULT else {"context_length": K}
+def train(root: Path, seed: int, K: int, arguments: argparse.Namespace) -> tuple[UniMASKPolicy, dict[str, Any]]:
+    """A policy, and what the record says of its training."""
+    settings = {"mask_seed": seed, **arguments.settings} | ({} if K == DEFAULT else {"context_length": K})
     trainer = Trainer(settings, root, seed=seed, steps=arguments.updates, batch_size=arguments.batch_size)
     began = time.process_time()
     for _ in trainer:
         pass
     spent = time.process_time() - began
-    policy = trainer.policy.eval()
-    if arguments.save is not None:
-        name = f"{root.name}_{seed}{'' if K == DEFAULT else f'_k{K}'}"
-        policy.save_pretrained(arguments.save / name)
-    facts = {"updates": arguments.updates, "train_processor_seconds": round(spent, 1), **trainer.record()}
-    facts |= {"policy": {name: getattr(policy.config, name) for name in KEPT}}
+    return trainer.policy.eval(), {"train_processor_seconds": round(spent, 1), **trainer.record()}
+
+
+def policy_runs(root: Path, seed: int, K: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """One policy trained on a dataset, and its success on each of the dataset's tasks."""
+    folder = arguments.save and arguments.save / f"{root.name}_{seed}{'' if K == DEFAULT else f'_k{K}'}"
+    if folder and folder.exists():
+        policy, facts = UniMASKPolicy.from_pretrained(folder), {}
+    else:
+        policy, facts = train(root, seed, K, arguments)
+        if folder:
+            policy.save_pretrained(folder)
+    facts |= {"updates": int(policy.updates), "policy": {name: getattr(policy.config, name) for name in KEPT}}
     tasks, found = provenance_of(root)["task"].split(","), []
     objects = read_info(root)["features"]["observation.environment_state"]["shape"][0] // OBJECT
     for task in tasks:
@@ -120,7 +126,7 @@ def main() -> None:
         record["runs"] += [{**names, **run} for run in found]
         write_json(arguments.output, record)
         for run in found:
-            print(model, root.name, seed, run["task"], updates, run["success"], run["train_processor_seconds"])
+            print(model, root.name, seed, run["task"], updates, run["success"], run.get("train_processor_seconds"))
 
 
 if __name__ == "__main__":
