@@ -214,3 +214,9 @@ def test_the_default_is_beside_a_perceptron_at_its_best(task):
     assert mean_success(ours) > mean_success(best) - 0.05
     seconds = [statistics.mean(run["train_processor_seconds"] for run in runs) for runs in (ours, best)]
     assert seconds[0] < 10 * seconds[1]
+
+
+def test_one_model_for_six_tasks_is_beside_one_for_each():
+    together = arm_runs("arm_six.json")
+    assert {run["task"] for run in together} == set(ARM)
+    assert mean_success(together) >= mean_success(arm_runs("arm_k5.json", model="unimask")) - 0.05
