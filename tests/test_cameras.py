@@ -192,6 +192,25 @@ def test_acting_answers_as_the_recorded_window_does_and_looks_once(make, batch, 
         torch.testing.assert_close(asked, actions[step], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("hidden", ["", ", top[0]", ", wrist[:t+1]"], ids=["all", "later ones", "one camera's"])
+def test_acting_answers_as_the_recorded_window_does_where_pictures_are_hidden(make, batch, hidden):
+    """An action is predicted from the place before it, which is a picture's, hidden or not."""
+    question = f"a[t] | state[:t+1], a[:t]{hidden}"
+    policy = make(attention="causal", training_masks=question, inference_mask=question)
+    actions = [policy.select_action(observation(batch, step)) for step in range(K)]
+    recorded = {**batch, "action": torch.stack(actions, 1), "action_is_pad": torch.zeros(3, K, dtype=torch.bool)}
+    for step in range(K):
+        asked = policy.infer(recorded, question, t=step).most_likely("a")[:, step]
+        torch.testing.assert_close(asked, actions[step], rtol=1e-4, atol=1e-4)
+    slid = policy.select_action(observation(batch, 0))
+    later = {key: value.roll(-1, dims=1) if value.ndim > 1 else value for key, value in recorded.items()}
+    for key, value in observation(batch, 0).items():
+        if key in later:
+            later[key][:, -1] = value
+    asked = policy.infer(later, question, t=K - 1).most_likely("a")[:, K - 1]
+    torch.testing.assert_close(asked, slid, rtol=1e-4, atol=1e-4)
+
+
 def test_a_missing_camera_is_named(make, batch):
     shown = observation(batch, 0)
     del shown["observation.images.wrist"]

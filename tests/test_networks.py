@@ -346,15 +346,17 @@ def test_a_rollouts_cache_changes_no_prediction_and_computes_each_token_once(kin
         shown = {name: torch.zeros(B, K, dtype=torch.bool) for name in factors}
         for name in factors:
             shown[name][:, : {"s": step + 1, "a": step}.get(name, 1)] = True
+        asked = {name: torch.zeros(B, K, dtype=torch.bool) for name in factors}
+        asked["a"][:, step] = True
         with torch.no_grad():
-            kept, anew = (network(window, shown, True, c)["a"] for c in (cache, None))
+            kept, anew = network(window, shown, True, cache, asked)["a"], network(window, shown, True)["a"]
         for x, y in zip(kept, anew, strict=True):
             torch.testing.assert_close(x[:, step], y[:, step])
     assert counted[::2] == [properties + 1] + [2] * (K - 1)
     # Another history, another question or other environments: what was kept is not used.
     shown["a"][0, 0] = False
     with torch.no_grad():
-        kept, anew = (network(window, shown, True, c)["a"] for c in (cache, None))
+        kept, anew = network(window, shown, True, cache, asked)["a"], network(window, shown, True)["a"]
     for x, y in zip(kept, anew, strict=True):
         torch.testing.assert_close(x[:, K - 1], y[:, K - 1])
     assert counted[-2] == properties + 2 * K - 1

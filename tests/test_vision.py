@@ -1,5 +1,7 @@
 """A token for each shown picture; what is hidden, NaN or not, changes none."""
 
+import math
+
 import pytest
 import torch
 
@@ -8,10 +10,11 @@ from lerobot_unimask.networks.vision import CameraEncoder
 B, K, SHAPE, D = 2, 4, (3, 64, 64), 16
 
 
-@pytest.fixture(scope="module", params=[None, "resnet18"])
+@pytest.fixture(scope="module", params=[(None, True), (None, False), ("resnet18", True)], ids=str)
 def encoder(request):
     torch.manual_seed(0)
-    return CameraEncoder(SHAPE, D, request.param)
+    backbone, fine = request.param
+    return CameraEncoder(SHAPE, D, backbone, fine=fine)
 
 
 @pytest.fixture
@@ -53,4 +56,15 @@ def test_nothing_shown(encoder, shown):
 
 def test_pictures_too_small_to_tell_apart_are_refused():
     with pytest.raises(ValueError, match="32 x 32"):
-        CameraEncoder((3, 32, 32), D, "resnet18")
+        CameraEncoder((3, 32, 32), D, "resnet18", fine=True)
+
+
+def test_points_come_with_sines_and_cosines(shown):
+    encoder = CameraEncoder(SHAPE, D, fine=True).eval()
+    picture = torch.rand(1, 1, *SHAPE)
+    with torch.no_grad():
+        token = encoder(picture, shown[:1, :1])[0, 0]
+        points = encoder.pool(encoder.backbone(2 * picture[0] - 1)).flatten().tolist()
+        numbers = points + [f(math.pi * 2**k * x) for f in (math.sin, math.cos) for x in points for k in range(4)]
+        expected = encoder.out(torch.tensor(numbers))
+    torch.testing.assert_close(token, expected, atol=1e-5, rtol=1e-5)

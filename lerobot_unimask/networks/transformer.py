@@ -60,10 +60,14 @@ class Transformer(nn.Module):
         outputs = enumerate(factors["s"].outputs) if config.state_residuals else ()
         self.on_course = {i: output for i, output in outputs if not output.discrete}
         self.heads = Heads(factors, config.predicted(factors), width)
-        weights = config.pretrained_backbone_weights
-        backbone: dict[str, Any] = {"backbone": config.vision_backbone, "weights": weights, "load": load_backbone}
+        encoder: dict[str, Any] = {
+            "backbone": config.vision_backbone,
+            "weights": config.pretrained_backbone_weights,
+            "load": load_backbone,
+            "fine": config.fine_inputs is not False,
+        }
         self.cameras = nn.ModuleDict(
-            {name: CameraEmbedding(camera.shape, width, **backbone) for name, camera in cameras.items()}
+            {name: CameraEmbedding(camera.shape, width, **encoder) for name, camera in cameras.items()}
         )
 
     def forward(
@@ -82,8 +86,8 @@ class Transformer(nn.Module):
             shown: factor -> (B, K) bool, True = shown.
             causal: whether tokens see only those before them, for all windows or each, (B,) bool. The prediction for a
                 token is then made from the one before it, and does not depend on whether itself is shown.
-            cache: of a rollout, with `causal=True`: only what it does not hold yet is computed, up to the last token
-                shown; only the prediction for the next one means something.
+            cache: of a rollout, with `causal=True` and `asked`: only what it does not hold yet is computed, up to the
+                token before the first asked one; only the prediction for that one means something.
             asked: factor -> (B, K) bool, True = asked: what is read of the predictions. On a processor the last block
                 and the heads compute nothing else. None: all.
         """
@@ -97,7 +101,8 @@ class Transformer(nn.Module):
         x = self.dropout(x + self.positions)
         static = x.device.type != "cpu" or torch.compiler.is_compiling()  # how much is computed never depends on masks
         if cache is not None:
-            predictions = self._predict_next(x, shown, cache)
+            assert asked is not None
+            predictions = self._predict_next(x, asked, cache)
         elif asked is not None and not self.stacked and not static:
             predictions = self._predict_asked(x, causal, asked)
         else:
@@ -143,9 +148,9 @@ class Transformer(nn.Module):
             x, _ = block(x, attend, None)
         return self.blocks[-1](x, attend, None, read=read)[0]
 
-    def _predict_next(self, x: Tensor, shown: dict[str, Tensor], cache: Cache) -> Predictions:
-        """The token after the last one of (B, N, W) that is shown in some window; of others nothing that counts."""
-        count = self._count(shown)
+    def _predict_next(self, x: Tensor, asked: dict[str, Tensor], cache: Cache) -> Predictions:
+        """The first of (B, N, W) tokens that is asked in some window; of others nothing that counts."""
+        count = self._before(asked)
         last = self.norm(self._extend(x[:, :count], cache))  # (B, 1, W)
         return self.heads(self._split(functional.pad(last, (0, 0, count, x.shape[1] - count - 1)), ASKABLE))
 
@@ -170,11 +175,12 @@ class Transformer(nn.Module):
         cache.inputs = x
         return new
 
-    def _count(self, shown: dict[str, Tensor]) -> int:
-        """Tokens up to the last state, picture or action that is shown in some window."""
-        steps = torch.stack([shown[name].any(0) for name in self.order], dim=1).flatten()  # (n K,)
-        numbers = steps.nonzero()
-        return len(self.properties) + (int(numbers[-1]) + 1 if len(numbers) else 0)
+    def _before(self, asked: dict[str, Tensor]) -> int:
+        """Tokens before the first state or action that is asked in some window: what is shown, and a picture that is
+        not, from whose place an action is predicted."""
+        nothing = torch.zeros_like(asked["s"][0])
+        steps = torch.stack([asked[name].any(0) if name in ASKABLE else nothing for name in self.order], dim=1)
+        return len(self.properties) + int(steps.flatten().nonzero()[0])
 
     def _stack(self, tokens: dict[str, Tensor]) -> Tensor:
         return self.stack(torch.cat(list(tokens.values()), dim=-1))  # (B, K, (F + cameras) W) -> (B, K, W)

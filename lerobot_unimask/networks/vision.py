@@ -43,6 +43,9 @@ def _group_norms(module: nn.Module) -> nn.Module:
 class CameraEncoder(nn.Module):
     """A convolutional network, a spatial softmax (Finn et al., 2016, as LeRobot's diffusion policy has it), a layer.
 
+    The spatial softmax finds points; their places, -1 to 1, are numbers as a state's are. Where those come with sines
+    and cosines (`NumberEncoding`) so do these, or what follows could not tell on which side of a wall a point lies.
+
     Args:
         shape: channels, height and width of the pictures; others are resized.
         width: size of a token, D.
@@ -50,10 +53,13 @@ class CameraEncoder(nn.Module):
         weights: name of that ResNet's weights in torchvision; None: drawn. With weights its batch norms stay, and are
             used as in evaluation, so that no picture depends on others of its batch.
         load: whether these weights are fetched; a checkpoint brings its own.
+        fine: whether points come with sines and cosines.
 
     Raises:
         ValueError: pictures so small that the spatial softmax has one place to look at.
     """
+
+    frequencies: Tensor
 
     def __init__(
         self,
@@ -62,6 +68,8 @@ class CameraEncoder(nn.Module):
         backbone: str | None = None,
         weights: str | None = None,
         load: bool = True,
+        *,
+        fine: bool,
     ):
         super().__init__()
         if backbone is None:
@@ -80,7 +88,10 @@ class CameraEncoder(nn.Module):
                 "of each map is left, so that all pictures would look the same; image_size has to be larger"
             )
         self.pool = SpatialSoftmax(maps, num_kp=KEYPOINTS)
-        self.out = nn.Linear(2 * KEYPOINTS, width)
+        self.fine = fine
+        # Wavelengths of a picture's whole side, a half, a quarter and an eighth
+        self.register_buffer("frequencies", torch.pi * 2.0 ** torch.arange(4), persistent=False)
+        self.out = nn.Linear(2 * KEYPOINTS * (1 + 2 * 4 if fine else 1), width)
         self.width = width
         self.size = (shape[1], shape[2])
         self.train()
@@ -117,16 +128,19 @@ class CameraEncoder(nn.Module):
         """(N, C, H, W) -> (N, D)."""
         pictures, dtype = resized(pictures, self.size), self.out.weight.dtype
         pictures = pictures.to(dtype) / 255 if pictures.dtype == torch.uint8 else pictures.to(dtype)
-        keypoints = self.pool(self.backbone(2 * pictures - 1)).flatten(1)  # (N, 2 * KEYPOINTS)
-        return self.out(keypoints)
+        points = self.pool(self.backbone(2 * pictures - 1)).flatten(1)  # (N, 2 * KEYPOINTS)
+        if self.fine:
+            angles = (points.unsqueeze(-1) * self.frequencies).flatten(1)
+            points = torch.cat([points, angles.sin(), angles.cos()], dim=-1)
+        return self.out(points)
 
 
 class CameraEmbedding(nn.Module):
     """One camera's tokens. Hidden is learned, as in `FactorEmbedding`. For arguments see `CameraEncoder`."""
 
-    def __init__(self, shape: Sequence[int], width: int, **backbone: Any):
+    def __init__(self, shape: Sequence[int], width: int, **encoder: Any):
         super().__init__()
-        self.encoder = CameraEncoder(shape, width, **backbone)
+        self.encoder = CameraEncoder(shape, width, **encoder)
         self.hidden = nn.Parameter(0.02 * torch.randn(width))
 
     def forward(self, value: Tensor, shown: Tensor) -> Tensor:

@@ -88,6 +88,19 @@ def _action_rules(*records: Record) -> str:
     return markdown_table(("action rule", "success", "mean return"), rows)
 
 
+def _from_pictures(*records: Record) -> str:
+    rows = (
+        (
+            "blind" if "blind" in record["path"] else "sees it",
+            _evaluated(record),
+            f"{record['overall']['pc_success']:.0f} %",
+            str(record["overall"]["n_episodes"]),
+        )
+        for record in records
+    )
+    return markdown_table(("the goal in the picture", "return", "success", "rollouts"), rows)
+
+
 def _beside_the_optimum(record: Record) -> str:
     ours, best = record["mean"], record["optimum"]["losses"]
     rows = ((f"`{task}`", f"{ours[task]:.3f}", f"{best[task]:.3f}", f"{ours[task] - best[task]:.3f}") for task in TASKS)
@@ -340,6 +353,7 @@ def _remembered_returns(record: Record) -> str:
 KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of these records
     r"task \| this policy \| spread": _beside_the_papers_model,
     r"action rule": _action_rules,
+    r"the goal in the picture": _from_pictures,
     r"task \| this policy \| best": _beside_the_optimum,
     r"task \| 7.5 % causal": _causal_share,
     r"sampled rollouts": _asked_rollouts,
