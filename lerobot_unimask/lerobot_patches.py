@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from draccus.parsers import decoding
+from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -45,6 +47,7 @@ def apply() -> None:
     _work_offline()
     _record_integers()
     _say_in_a_line_what_decodes()
+    _say_why_a_config_is_refused()
     _start_metaworld()
 
 
@@ -151,6 +154,26 @@ def _say_in_a_line_what_decodes() -> None:
         return line not in said[:-1]
 
     logging.getLogger("lerobot.utils.import_utils").addFilter(shorten)
+
+
+def _say_why_a_config_is_refused() -> None:
+    """LeRobot's parser keeps a config's own reason to itself: "Couldn't instantiate class UniMASKConfig using the given
+    arguments."
+
+    Other policies: their configs' reasons are said too.
+    """
+    decode = decoding.decode_dataclass
+
+    @functools.wraps(decode)
+    def decode_or_say_why(cls: Any, content: Any, path: Any = ()) -> Any:
+        try:
+            return decode(cls, content, path)
+        except ParsingError as error:
+            if isinstance(error, DecodingError) or error.__cause__ is None:
+                raise
+            raise DecodingError(path, str(error.__cause__)) from error.__cause__
+
+    vars(decoding)["decode_dataclass"] = decode_or_say_why
 
 
 def _work_offline() -> None:

@@ -4,7 +4,9 @@ import json
 
 import draccus
 import pytest
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_unimask import MaskError, UniMASKConfig
 from lerobot_unimask.configuration_unimask import MOST
@@ -243,3 +245,11 @@ def test_properties_are_saved_with_the_checkpoint(tmp_path):
     assert loaded.properties == ["observation.visits_corner"]
     assert loaded.features == config.features
     loaded.set_dataset_feature_metadata(LABELLED)  # fine-tuning on the same columns
+
+
+@pytest.mark.parametrize(
+    ("flag", "said"), [("--policy.chunk_size=6", "chunk_size is 6"), ("--policy.attention=up", "attention is 'up'")]
+)
+def test_the_command_line_says_why_a_setting_is_refused(flag, said):
+    with pytest.raises(ParsingError, match=said):
+        draccus.parse(TrainPipelineConfig, args=["--policy.type=unimask", "--dataset.repo_id=local/x", flag])

@@ -230,6 +230,7 @@ def test_a_chosen_goal_is_kept_and_never_the_start():
         ("#####\n#O#G#\n#####", "cannot be reached"),
         ("mediun", "umaze, medium, large"),
         ("", "neither"),
+        (None, "None"),
     ],
 )
 def test_bad_mazes_are_refused(maze, message):

@@ -101,6 +101,8 @@ def parse_maze(maze: str) -> Maze:
         ValueError: neither a known name nor a rectangle of these characters, a border cell that is not wall, fewer
             than two free cells (a start and a goal), or a free cell that cannot be reached from another.
     """
+    if not isinstance(maze, str):  # LeRobot's parser reads YAML, in which # begins a comment
+        raise ValueError(f"The maze is {maze!r}; it is a name or a text, which quotes keep together: '\"#####...\"'.")
     text = MAZES.get(maze, maze).replace("\\", "\n").strip()
     rows = tuple(row.strip() for row in text.split("\n"))
     unknown = sorted(set("".join(rows)) - set("#OG"))
