@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from policies import CONTINUOUS_STATS, assert_same_answers, assert_unchanged, without_return
+from policies import CONTINUOUS_STATS, SMALL, assert_same_answers, assert_unchanged, without_return
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -47,7 +47,7 @@ def test_defaults_and_declared_features_alone_make_a_policy(tmp_path):
 
 
 def test_make_policy_reads_a_datasets_metadata(doorkey, doorkey_batch):
-    config = make_policy_config("unimask", device="cpu", width=16, depth=1, heads=2, feedforward_width=16)
+    config = make_policy_config("unimask", device="cpu", **SMALL)
     policy = make_policy(config, ds_meta=doorkey.meta)
     assert isinstance(policy, PreTrainedPolicy)
     assert list(policy.factors) == ["s", "a", "rtg"]
