@@ -33,6 +33,9 @@ def alone(test):
     def forked(**fixtures):
         child = os.fork()
         if child == 0:
+            # Torch makes its pool of threads anew after a fork when it is first asked for, and two that ask at once get
+            # none ("Invalid thread pool"): one asks before there are others.
+            torch.set_num_threads(torch.get_num_threads())
             try:
                 test(**fixtures)
             except BaseException:
