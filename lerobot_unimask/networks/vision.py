@@ -43,8 +43,8 @@ def _group_norms(module: nn.Module) -> nn.Module:
 class CameraEncoder(nn.Module):
     """A convolutional network, a spatial softmax (Finn et al., 2016, as LeRobot's diffusion policy has it), a layer.
 
-    The spatial softmax finds points; their places, -1 to 1, are numbers as a state's are. Where those come with sines
-    and cosines (`NumberEncoding`) so do these, or what follows could not tell on which side of a wall a point lies.
+    The spatial softmax finds points; their places, -1 to 1, are numbers as a state's are, and come with sines and
+    cosines where those do (`NumberEncoding`).
 
     Args:
         shape: channels, height and width of the pictures; others are resized.

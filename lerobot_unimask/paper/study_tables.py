@@ -135,12 +135,16 @@ def _text(cell: Mapping[str, float] | None, digits: int) -> str:
     return f"{cell['mean']:.{digits}f}{error}"
 
 
+def _returned(row: Mapping[str, float]) -> str:
+    return f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}"
+
+
 def acting_table(record: Mapping[str, Any]) -> str:
     rows = (
         (
             row["chunk_size"],
             row["n_action_steps"],
-            f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
+            _returned(row),
             f"{row['success']:.3f}",
             f"{row['ms']:.1f}",
             f"{row['passes']:.2f}",
@@ -164,7 +168,7 @@ def goals_table(record: Mapping[str, Any]) -> str:
         (
             row["chunk_size"],
             SHOWN[row["shown"]].format(**row),
-            f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
+            _returned(row),
             f"{row['success']:.3f}",
         )
         for row in record["goals"]
@@ -177,7 +181,7 @@ def tasks_table(record: Mapping[str, Any]) -> str:
         (
             f"`{row['maze']}`",
             "nothing: hidden" if row["asked"] is None else f"`{row['asked']}`",
-            f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
+            _returned(row),
             f"{row['success']:.3f}",
         )
         for row in record["tasks"]
@@ -190,7 +194,7 @@ def real_time_table(record: Mapping[str, Any]) -> str:
         (
             row["delay"],
             "with" if row["mask"] else "without",
-            f"{row['mean_return']:.2f} ± {row['standard_error']:.2f}",
+            _returned(row),
             *(f"{row[name]:.3f}" for name in ("seam_mean", "seam_99", "inside_mean", "inside_99")),
         )
         for row in record["real_time"]["rows"]
