@@ -13,8 +13,8 @@ from typing import Any, NoReturn
 import datasets
 import pandas as pd
 from datasets.features.features import string_to_arrow
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.feature_utils import get_delta_indices
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import default_collate
@@ -202,9 +202,10 @@ def open_dataset(
         check_format(root)
     check_home()
     repo_id = repo_id or LOCAL
-    meta = LeRobotDatasetMetadata(repo_id, root=root)
-    deltas = resolve_delta_timestamps(config, meta)
-    dataset = LeRobotDataset(repo_id, root=root, delta_timestamps=deltas, episodes=episodes, return_uint8=True)
+    dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, return_uint8=True)
+    # The constructor takes seconds, which depend on the metadata; to read these twice takes as long as all the rest.
+    dataset.delta_timestamps = resolve_delta_timestamps(config, dataset.meta)
+    dataset.reader.delta_indices = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
     read_cameras(dataset, config)
     return dataset
 
