@@ -32,6 +32,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "unimask_multi_task": {"training_masks": list(QUESTIONS.values())},
     "unimask_random_mask": {"training_masks": "random_mask"},
     "acts_and_asks": {"training_masks": "random_mask", "attention": "both"},
+    "acts_and_asks_gaussian": {"training_masks": "random_mask", "attention": "both", "continuous_head": "gaussian"},
     "feedforward": {"network": "feedforward", "attention": None},
     "decision_transformer": {"network": "decision_transformer", "attention": None},
     "decision_gpt": {"attention": "causal"},
