@@ -34,10 +34,10 @@ from dataset_builders.writer import (
     provenance_of_now,
     statistics_columns,
 )
-from lerobot_unimask.data.episodes import check_folder, check_format, read_info
+from lerobot_unimask.data.episodes import check_folder, check_format, check_whole, read_info
 from lerobot_unimask.data.factors import is_numeric
 from lerobot_unimask.data.returns import return_to_go
-from lerobot_unimask.data.soundness import data_files, innermost
+from lerobot_unimask.data.soundness import data_files, episode_files, innermost
 from lerobot_unimask.sharing.hub import commit_of
 
 Episode = dict[str, np.ndarray]  # a dataset's columns of numbers: (T,) where D = 1, else (T, D)
@@ -142,6 +142,7 @@ def add_label(
     root = Path(root).expanduser().resolve()
     check_folder(root)
     check_format(root)
+    check_whole(root)
     if not re.fullmatch(r"observation\.[\w.]+", name):
         raise ValueError(f"name is {name!r}; a label is named observation.NAME, or LeRobot reads no windows of it.")
     if output is None and (commit := commit_of(root)):
@@ -263,10 +264,6 @@ def copy_rest(root: Path, partial: Path, without: Sequence[str] = ()) -> None:
         return [name for name in names if Path(folder).relative_to(root).parts == ("videos",) and name in without]
 
     shutil.copytree(root, partial, copy_function=copy, ignore=left_out)
-
-
-def episode_files(root: Path) -> list[Path]:
-    return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
 
 
 def stored_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:

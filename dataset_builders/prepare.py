@@ -20,11 +20,27 @@ import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_PREFIX, OBS_STATE
 
 from dataset_builders.folders import refuse_existing, written_whole
-from dataset_builders.label import copy_rest, episode_files, flat_numbers, rewrite, stored_schema, with_statistics
+from dataset_builders.label import copy_rest, flat_numbers, rewrite, stored_schema, with_statistics
 from dataset_builders.writer import EpisodeStatistics, as_cells, dataset_statistics, episode_statistics
-from lerobot_unimask.data.episodes import TASKS, check_age, check_folder, is_type, order_of_tasks
+from lerobot_unimask.data.episodes import (
+    TASKS,
+    absent_files,
+    check_age,
+    check_folder,
+    check_tables,
+    check_whole,
+    is_type,
+    order_of_tasks,
+)
 from lerobot_unimask.data.factors import TEXTS, flat_names
-from lerobot_unimask.data.soundness import are_statistics, check_columns, check_statistics, data_files
+from lerobot_unimask.data.soundness import (
+    are_statistics,
+    check_columns,
+    check_statistics,
+    data_files,
+    episode_files,
+    episode_lengths,
+)
 from lerobot_unimask.records import read_json, write_json
 
 PICTURES = ("image", "video")
@@ -100,7 +116,7 @@ def make_plan(
         if not have and wanted not in asked.values() and found:
             asked[found[0]] = wanted
     plan.drop = [name for name in drop if name != "missing"]
-    absent = [] if plan.convert else cameras_without_files(root, features)
+    absent = [] if plan.convert else [key for key in absent_files(root, info) if key]
     for key, entry in features.items():
         seen = key.startswith(OBS_PREFIX) or key in (*asked, *plan.drop, *absent)
         if entry["dtype"] in PICTURES and not seen:
@@ -114,7 +130,11 @@ def make_plan(
         if key not in plan.drop:
             plan.drop.append(key)
             plan.why.append(f"--drop {key}: its files are not in {root / 'videos'}.")
+    if not plan.convert:
+        check_whole(root, without=plan.drop)
+        check_tables(root, info, without=plan.drop)
     stats = read_json(root / "meta" / "stats.json") if (root / "meta" / "stats.json").exists() else {}
+    stats = stats if isinstance(stats, Mapping) else {}
     for old, entry in features.items():
         new = plan.rename.get(old, old)
         if old in plan.drop:
@@ -176,21 +196,6 @@ def _fault(known: Mapping[str, Any], size: int, is_read: bool) -> str | None:
 def _is_read(key: str) -> bool:
     """Whether policies read columns of that name; others may hold what they like."""
     return key == ACTION or key.startswith(OBS_PREFIX)
-
-
-def cameras_without_files(root: Path, features: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The video columns of which a file that the metadata name is not there."""
-    lost = []
-    for key in (key for key, entry in features.items() if entry["dtype"] == "video"):
-        wanted = set()
-        for path in episode_files(root):
-            columns = [f"videos/{key}/{kind}_index" for kind in ("chunk", "file")]
-            if set(columns) <= set(pq.read_schema(path).names):
-                wanted |= {tuple(row.values()) for row in pq.read_table(path, columns=columns).to_pylist()}
-        files = [root / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4" for chunk, file in wanted]
-        if not files or not all(file.exists() for file in files):
-            lost.append(key)
-    return lost
 
 
 def prepare(root: Path, plan: Plan, *, output: Path | None = None) -> Path:
@@ -262,7 +267,7 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
 
     for path in data_files(source):
         rewrite(path, partial / path.relative_to(source), with_columns)
-    lengths = _lengths(source)
+    lengths = episode_lengths(source)
     measured = {
         old: flat_names(old_features[old].get("names")) for old in new_names if new_names[old] in plan.statistics
     }
@@ -271,7 +276,8 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
     for path in episode_files(source):
         rewrite(path, partial / path.relative_to(source), lambda table: _episodes_table(table, plan, found))
     path = source / "meta" / "stats.json"
-    old_stats = read_json(path) if path.exists() else {}
+    found_stats = read_json(path) if path.exists() else {}
+    old_stats = found_stats if isinstance(found_stats, Mapping) else {}
     stats = {plan.rename.get(k, k): v for k, v in old_stats.items() if k not in plan.drop and are_statistics(v)}
     for key, statistics in found.items():
         stats[key] = {name: value.tolist() for name, value in dataset_statistics(statistics).items()}
@@ -287,7 +293,7 @@ def _read_numbers(source: Path, features: Mapping[str, Mapping[str, Any]], plan:
         new = plan.rename.get(old, old)
         if new in wanted:
             parts = [flat_numbers(pq.read_table(path, columns=[old]).column(old)) for path in data_files(source)]
-            columns[new] = np.concatenate(parts).reshape(sum(_lengths(source)), -1)
+            columns[new] = np.concatenate(parts).reshape(sum(episode_lengths(source)), -1)
     return columns
 
 
@@ -336,7 +342,3 @@ def _episodes_table(table: pa.Table, plan: Plan, found: Mapping[str, EpisodeStat
         new = f"{kind}/{plan.rename[key]}/{rest.rpartition('/')[2]}" if key in plan.rename else name
         kept.append((new, table.column(name)))
     return with_statistics(pa.table([column for _, column in kept], names=[name for name, _ in kept]), found)
-
-
-def _lengths(source: Path) -> np.ndarray:
-    return np.concatenate([pq.read_table(path, columns=["length"]).column("length") for path in episode_files(source)])

@@ -28,7 +28,7 @@ from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
-from lerobot_unimask.data.episodes import check_format, check_home
+from lerobot_unimask.data.episodes import open_checked, sound_statistics
 from lerobot_unimask.data.taking_over import keep_to
 from lerobot_unimask.envs.metaworld.environment import load_metaworld
 from lerobot_unimask.sharing import hub
@@ -94,12 +94,11 @@ def _read_as_this_policy_needs() -> None:
                 "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
                 "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
             )
-        check_home()
-        root = Path(cfg.dataset.root or "")
-        if cfg.dataset.root and (root / "meta" / "info.json").exists():
-            check_format(root)  # one that is old or damaged ends in one sentence
+        root = cfg.dataset.root and Path(cfg.dataset.root)
         with _without_imagenet_statistics(cfg):
-            dataset = lerobots_make_dataset(cfg)
+            dataset = open_checked(
+                lambda: lerobots_make_dataset(cfg), root, cfg.dataset.repo_id, cfg.dataset.episodes
+            )  # one that is old or damaged ends in one sentence
         opened[:] = [dataset]
         reads.read_cameras(dataset, cfg.trainable_config)
         keep_to(dataset.meta, dataset.episodes)
@@ -110,7 +109,8 @@ def _read_as_this_policy_needs() -> None:
 
     @functools.wraps(lerobots_make_both)
     def make_train_eval_datasets(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-        with _without_imagenet_statistics(cfg):
+        statistics = sound_statistics() if cfg.trainable_config.type == "unimask" else contextlib.nullcontext()
+        with _without_imagenet_statistics(cfg), statistics:
             both = lerobots_make_both(cfg)
         if cfg.trainable_config.type == "unimask" and both[1] is not None:  # opened anew, each with its episodes
             for part in both:

@@ -19,7 +19,7 @@ from lerobot_unimask.asking.answers import ContinuousDistribution
 from lerobot_unimask.asking.answers import answer as answer_question
 from lerobot_unimask.data.checkpoints import episodes_trained_on
 from lerobot_unimask.data.episodes import bounds_of, read_windows
-from lerobot_unimask.data.factors import RETURN_SO_FAR, Output
+from lerobot_unimask.data.factors import RETURN_SO_FAR, TASK, Output
 from lerobot_unimask.language.masks import Mask, tabulate
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
 
@@ -133,30 +133,25 @@ def _mixture(prediction: Tensor, output: Output) -> MixtureSameFamily:
     return MixtureSameFamily(Categorical(logits=logits), Independent(Normal(means, scales.exp()), 1))
 
 
-def latency(policy: UniMASKPolicy, environments: int = 1, calls: int = 100) -> dict[str, float]:
-    """Milliseconds of `select_action` once the window slides, with the policy's own inference mask: median and
-    quartiles over the calls."""
+def latency(policy: UniMASKPolicy, batch: dict[str, Tensor], calls: int = 100) -> dict[str, float]:
+    """Milliseconds of `select_action` once the window slides, with the policy's own inference mask and a step of
+    recorded windows as what it observes: median and quartiles over the calls."""
+    observed = {name: value[:1, 0] for name, value in policy.make_window(batch).values.items()}
+    columns = policy.config.features["s"]
+    parts = observed["s"].split([column.size for column in columns], dim=-1)
+    observation: dict[str, Any] = {column.key: part for column, part in zip(columns, parts, strict=True)}
+    observation |= {camera.key: observed[name] for name, camera in policy.cameras.items()}
+    observation |= {RETURN_SO_FAR: torch.zeros(1, 1), TASK: batch[TASK][0] if TASK in batch else None}
     policy.reset()
-    mean = policy.statistics.get_buffer("s_mean")
     times = []
     for call in range(calls + policy.config.context_length):
-        state = mean.expand(environments, -1).clone()
-        batch: dict[str, Any] = {RETURN_SO_FAR: torch.zeros(environments, 1)}
-        start = 0
-        for feature in policy.config.features["s"]:
-            batch[feature.key] = (
-                state[:, start : start + feature.size].round()
-                if feature.categories
-                else (state[:, start : start + feature.size])
-            )
-            start += feature.size
         began = time.perf_counter()
-        policy.select_action(batch)
+        policy.select_action(observation)
         if call >= policy.config.context_length:
             times.append(1000 * (time.perf_counter() - began))
     policy.reset()
     low, median, high = torch.tensor(times).quantile(torch.tensor([0.25, 0.5, 0.75])).tolist()
-    return {"median_ms": median, "quartiles_ms": [low, high], "environments": environments}
+    return {"median_ms": median, "quartiles_ms": [low, high], "environments": 1}
 
 
 def measure(policy: UniMASKPolicy, dataset: LeRobotDataset, episodes: Sequence[int], *, ahead: int) -> dict[str, Any]:
@@ -185,4 +180,5 @@ def measure(policy: UniMASKPolicy, dataset: LeRobotDataset, episodes: Sequence[i
         record["ahead"] = error_ahead(policy, batch, ahead)
     if policy.config.attention == "both":
         record["disagreement_nats"] = {question: disagreement(policy, batch, question) for question in questions}
+    record["latency"] = latency(policy, batch)
     return record

@@ -281,6 +281,22 @@ def test_a_one_number_state_comes_with_or_without_its_axis(state):
     assert UniMASKPolicy(config).select_action({"observation.state": state}).shape == (2, 1)
 
 
+def test_one_environments_columns_come_with_or_without_its_axis():
+    """LeRobot's processor makes a batch of `observation.state` alone."""
+    numbers = {"observation.state": 3, "observation.velocity": 3, "observation.gripper": 1, "action": 2}
+    config = UniMASKConfig(device="cpu", width=16, depth=1, heads=2, feedforward_width=16, states=list(numbers)[:-1])
+    config.set_dataset_feature_metadata(
+        {key: {"dtype": "float32", "shape": (size,), "names": None} for key, size in numbers.items()}
+    )
+    policy = UniMASKPolicy(config).eval()
+    batched = {key: torch.arange(size).float()[None] for key, size in numbers.items()}
+    expected = policy.select_action(batched)
+    policy.reset()
+    velocity, gripper = (batched[f"observation.{name}"].squeeze() for name in ("velocity", "gripper"))
+    found = policy.select_action({**batched, "observation.velocity": velocity, "observation.gripper": gripper})
+    assert torch.equal(found, expected)
+
+
 WITH_CORNER = {
     **CONTINUOUS_FEATURES,
     "observation.corner": {"dtype": "int64", "shape": (1,), "names": None, "categories": [2]},

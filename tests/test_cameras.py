@@ -14,7 +14,7 @@ from lerobot_unimask.data import frames
 from lerobot_unimask.language.grammar import MaskError
 from lerobot_unimask.language.masks import TASKS, Mask, parse_token, tabulate
 from lerobot_unimask.language.training_masks import TrainingMasks
-from lerobot_unimask.measures import action_error
+from lerobot_unimask.measures import action_error, latency
 from lerobot_unimask.sharing import cards
 from lerobot_unimask.validation import task_losses
 
@@ -175,6 +175,10 @@ def count_pictures(policy):
 
 
 # --- Acting and asking -----------------------------------------------------------------------------------------------
+
+
+def test_latency_is_that_of_acting_with_pictures(make, batch):
+    assert latency(make(), batch, calls=2)["median_ms"] > 0
 
 
 @pytest.mark.parametrize("attention", ["both", "bidirectional", "causal"])

@@ -140,11 +140,12 @@ def test_directions_that_say_the_same_disagree_by_nothing(make, root):
 def test_a_record_holds_what_applies(make, root, settings, ahead, parts):
     policy = make(**settings)
     record = measure(policy, open_dataset(policy.config, root), LAST, ahead=ahead)
-    assert set(record) == {"what", "units", "windows", "episodes", "trained_on_episodes"} | parts
+    assert set(record) == {"what", "units", "windows", "episodes", "trained_on_episodes", "latency"} | parts
 
 
-def test_latency_is_a_median_between_quartiles(make):
-    timed = latency(make(), calls=5)
+def test_latency_is_a_median_between_quartiles(make, root):
+    policy = make()
+    timed = latency(policy, windows(policy, root), calls=5)
     assert 0 < timed["quartiles_ms"][0] <= timed["median_ms"] <= timed["quartiles_ms"][1]
 
 

@@ -12,13 +12,13 @@ import pytest
 import torch
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import factory
+from lerobot.datasets import dataset_metadata, factory
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_policy
 
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig
-from lerobot_unimask.data import soundness
+from lerobot_unimask.data import episodes, soundness
 from lerobot_unimask.data.episodes import open_dataset
 
 SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "device": "cpu", "push_to_hub": False}
@@ -104,6 +104,18 @@ def test_absent_statistics_are_computed(root, absent):
         torch.testing.assert_close(after[name], value, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("fault", [None, "x", [1], {"mode": "x"}, {"mean": [[0.0], [0.0, 1.0]]}, {"std": [None]}])
+@pytest.mark.parametrize("key", ["action", "a column that is not read"])
+def test_what_are_no_statistics_is_left_out(root, fault, key, caplog):
+    """Also ragged ones, which numpy refuses, and those of a column that no policy reads."""
+    before = policy_of(root).statistics.state_dict()
+    spoil_statistics(root, key, lambda stats, key: stats.update({key: fault}))
+    after = policy_of_episodes(root, None).statistics.state_dict()
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=1e-3, atol=1e-4)
+    assert key in caplog.text
+
+
 def test_time_comes_from_the_metadata_whatever_the_statistics_lack(root):
     for key in ("timestamp", "frame_index"):
         spoil_statistics(root, key, lambda stats, key: stats.pop(key))
@@ -164,6 +176,59 @@ def test_a_home_that_cannot_be_written_to_is_named(root, tmp_path, monkeypatch):
         policy_of_episodes(root, None)
     assert str(tmp_path / "home" / "datasets") in str(raised.value)
     with pytest.raises(OSError, match="HF_HOME"):
+        open_dataset(UniMASKConfig(**SMALL), root)
+
+
+def spoil_info(root, **entries):
+    path = root / "meta" / "info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
+
+
+def drop_rows(root, change):
+    (path,) = (root / "data").glob("*/*.parquet")
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+DATA = "data/chunk-000/file-000.parquet"
+DAMAGES = {
+    "no table": (lambda root: (root / DATA).unlink(), DATA),
+    "no episodes": (lambda root: shutil.rmtree(root / "meta" / "episodes"), "meta/episodes"),
+    "no tasks": (lambda root: (root / "meta" / "tasks.parquet").unlink(), "meta/tasks.parquet"),
+    "a table cut short": (lambda root: (root / DATA).write_bytes((root / DATA).read_bytes()[:-9]), DATA),
+    "tasks that are a pointer": (lambda root: (root / "meta" / "tasks.parquet").write_text("version https"), "tasks"),
+    "rows cut off": (lambda root: drop_rows(root, lambda table: table.slice(0, 590)), "590"),
+    "a column cut off": (lambda root: drop_rows(root, lambda table: table.drop_columns("action")), "action"),
+    "an episode too many": (lambda root: spoil_info(root, total_episodes=4), "4 episodes"),
+    "a frame too many": (lambda root: spoil_info(root, total_frames=601), "601 frames"),
+    "paths of the old format": (lambda root: spoil_info(root, data_path="{episode_index}.parquet"), "data_path"),
+}
+
+
+@pytest.mark.parametrize("named", [False, True], ids=["by its folder", "by its name"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_what_is_missing_or_damaged_is_named(root, damage, named, monkeypatch):
+    spoil, word = DAMAGES[damage]
+    spoil(root)
+    if named:
+        for module in (episodes, dataset_metadata):
+            monkeypatch.setattr(module, "HF_LEROBOT_HOME", root.parent)
+    with pytest.raises((FileNotFoundError, ValueError), match=str(root)) as raised:
+        open_dataset(UniMASKConfig(**SMALL), None if named else root, root.name)
+    assert word in str(raised.value)
+
+
+def test_files_that_are_not_read_may_be_missing(root):
+    """A dataset of which LeRobot has pulled some episodes."""
+    (path,) = (root / "data").glob("*/*.parquet")
+    table = pq.read_table(path)
+    path.unlink()
+    pq.write_table(table.slice(0, 200), path)
+    (episodes_path,) = (root / "meta" / "episodes").glob("*/*.parquet")
+    rows = pq.read_table(episodes_path)
+    at = rows.column_names.index("data/file_index")
+    pq.write_table(rows.set_column(at, "data/file_index", pa.array([0, 1, 1])), episodes_path)
+    assert len(open_dataset(UniMASKConfig(**SMALL), root, episodes=[0])) == 200
+    with pytest.raises(FileNotFoundError, match=r"data/chunk-000/file-001\.parquet"):
         open_dataset(UniMASKConfig(**SMALL), root)
 
 

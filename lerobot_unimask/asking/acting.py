@@ -301,8 +301,8 @@ def observed_state(model: LearntModel, batch: Mapping[str, Tensor]) -> Tensor:
         value = batch.get(feature.key)
         if value is not None:
             value = as_tensor(repr(feature.key), value).float()
-        if value is not None and value.ndim == 1 and feature.size == 1:
-            value = value.unsqueeze(-1)
+        if value is not None and value.ndim < 2 and (feature.size == 1 or value.numel() == feature.size):
+            value = value.reshape(-1, feature.size)  # LeRobot makes a batch of `observation.state` alone
         if value is None or value.ndim != 2 or value.shape[-1] != feature.size:
             found = "nothing" if value is None else f"shape {tuple(value.shape)}"
             raise ValueError(

@@ -35,13 +35,12 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.data.episodes import episode_numbers
-    from lerobot_unimask.measures import latency, measure
+    from lerobot_unimask.measures import measure
     from lerobot_unimask.records import versions
 
     policy, dataset = open_both(arguments)
     episodes = episode_numbers(arguments.episodes, len(dataset.meta.episodes))
     record = measure(policy, dataset, episodes, ahead=arguments.ahead)
-    record["latency"] = latency(policy)
     record["policy"] = policy.describe_origin()
     record |= {"command": arguments.text, "versions": versions()}
     print(json.dumps(record, indent=2))

@@ -3,30 +3,42 @@
 Legend of shapes: B windows, K steps, E episodes.
 """
 
+import contextlib
+import logging
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any, NoReturn
 
 import datasets
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 from datasets.features.features import string_to_arrow
+from lerobot.datasets import dataset_metadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.feature_utils import get_delta_indices
+from lerobot.datasets.io_utils import cast_stats_to_numpy
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
+from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 from torch.utils.data import default_collate
 
 from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.reads import read_cameras
-from lerobot_unimask.data.soundness import are_statistics
+from lerobot_unimask.data.soundness import are_statistics, data_files, episode_files, episode_lengths
 from lerobot_unimask.records import read_json
+
+logger = logging.getLogger(__name__)
 
 MAX_FPS = 1_000_000
 MAX_COUNT = 10**12  # of episodes, frames, numbers: more is a damaged file
 TASKS = "meta/tasks.parquet"
+FIELDS, OLD_FIELDS = ("chunk_index", "file_index", "video_key"), ("episode_chunk", "episode_index")
 MAX_DIMENSIONS = 5  # of a number of LeRobot's columns
 LOCAL = "local/dataset"  # the name of a dataset that is read from a folder, where nobody gives it one
 
@@ -45,8 +57,7 @@ def check_folder(root: Path) -> None:
 def check_format(root: Path) -> None:
     """
     Raises:
-        FileNotFoundError: it has no texts of tasks.
-        ValueError: its info.json, stats.json or tasks are damaged, or its format is one that LeRobot no longer reads.
+        ValueError: its info.json, tasks or tables are damaged, or its format is one that LeRobot no longer reads.
     """
     info = read_info(root)
     version = info["codebase_version"]
@@ -56,9 +67,7 @@ def check_format(root: Path) -> None:
             "--output=DIR` writes it anew."
         )
     check_age(root, version)
-    if not (root / TASKS).exists():
-        raise FileNotFoundError(f"{root} lacks {TASKS}, the texts of its tasks: part of the dataset has not arrived.")
-    if order_of_tasks(root) is not None:
+    if (root / TASKS).exists() and order_of_tasks(root) is not None:
         raise ValueError(
             f"{root / TASKS} does not list the texts of task_index 0, 1, 2 and so on, in this order, and LeRobot would "
             f"take one for another: `unimask prepare --dataset.root={root} --output=DIR` puts them in order."
@@ -70,13 +79,86 @@ def check_format(root: Path) -> None:
                 f"{entry['shape']}, which LeRobot has no column for: `unimask prepare --dataset.root={root} "
                 "--output=DIR` makes it one of numbers as they are stored."
             )
-    path = root / "meta" / "stats.json"
-    for key, known in (read_json(path) if path.exists() else {}).items():
-        if not are_statistics(known):
+    check_tables(root, info)
+
+
+def check_tables(root: Path, info: Mapping[str, Any], without: Sequence[str] = ()) -> None:
+    """
+    Args:
+        without: columns that need not be there.
+
+    Raises:
+        ValueError: a table of the columns or of the episodes cannot be read, lacks a column, or has other rows than the
+            metadata count, though no file is missing.
+    """
+    columns = {key for key, entry in info["features"].items() if entry["dtype"] != "video" and key not in without}
+    rows, episodes = 0, sum(_table(path).num_rows for path in episode_files(root))
+    for path in data_files(root):
+        table = _table(path)
+        rows += table.num_rows
+        lacking = sorted(columns - set(table.schema.to_arrow_schema().names))
+        if lacking:
             raise ValueError(
-                f"{path} holds for {key} what are no statistics, {str(known)[:80]}: `unimask prepare "
-                f"--dataset.root={root} --output=DIR` leaves them out, or recomputes them."
+                f"{path} lacks {', '.join(lacking)}, which meta/info.json names: fetch the file anew, or `unimask "
+                f"prepare --dataset.root={root} --drop {lacking[0]} --output=DIR` does without."
             )
+    if any(key not in without for key in absent_files(root, info)):
+        return
+    frames = int(episode_lengths(root).sum())
+    if rows != frames or frames < info["total_frames"] or episodes < info["total_episodes"]:
+        raise ValueError(
+            f"{root} counts {info['total_frames']} frames of {info['total_episodes']} episodes in meta/info.json, "
+            f"{frames} of {episodes} in meta/episodes, and has {rows} in data: these have to agree, so fetch anew what "
+            "is damaged."
+        )
+
+
+def _table(path: Path) -> pq.FileMetaData:
+    try:
+        return pq.read_metadata(path)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{path} cannot be read as a table ({reason}): copy it, or fetch it, anew.") from error
+
+
+def absent_files(root: Path, info: Mapping[str, Any], episodes: Sequence[int] | None = None) -> dict[str, list[str]]:
+    """What a dataset's metadata name and its folder lacks: a column of videos, or "" for all others -> paths.
+
+    Args:
+        episodes: those whose files count; None: all.
+    """
+    files = episode_files(root)
+    absent = {"": [TASKS] * (not (root / TASKS).exists()) + ["meta/episodes"] * (not files)}
+    for key in ["", *(key for key, entry in info["features"].items() if entry["dtype"] == "video")] if files else ():
+        place, pattern = (f"videos/{key}", "video_path") if key else ("data", "data_path")
+        names = [f"{place}/chunk_index", f"{place}/file_index"]
+        rows = {
+            tuple(row[name] for name in names)
+            for path in files
+            if set(names) <= set(pq.read_schema(path).names)
+            for row in pq.read_table(path, columns=["episode_index", *names]).to_pylist()
+            if episodes is None or row["episode_index"] in episodes
+        }
+        form = info.get(pattern) or {"data_path": DEFAULT_DATA_PATH, "video_path": DEFAULT_VIDEO_PATH}[pattern]
+        paths = [form.format(video_key=key, chunk_index=chunk, file_index=file) for chunk, file in sorted(rows)]
+        absent.setdefault(key, []).extend(path for path in paths or [place] if not (root / path).exists())
+    return {key: paths for key, paths in absent.items() if paths}
+
+
+def check_whole(root: Path, episodes: Sequence[int] | None = None, without: Sequence[str] = ()) -> None:
+    """
+    Raises:
+        FileNotFoundError: a file is missing that the metadata name for these episodes, but for columns `without`.
+    """
+    absent = absent_files(root, read_info(root), episodes)
+    paths = [path for key, found in absent.items() if key not in without for path in found]
+    if paths:
+        more = f" and {len(paths) - 1} more files" if len(paths) > 1 else ""
+        or_else = f", or `unimask prepare --dataset.root={root} --output=DIR` does without the camera"
+        raise FileNotFoundError(
+            f"{root} lacks {paths[0]}{more}, which belong to it: copy or fetch them anew"
+            f"{'' if absent.get('') else or_else}."
+        )
 
 
 def check_age(root: Path, version: str) -> None:
@@ -94,6 +176,7 @@ def check_age(root: Path, version: str) -> None:
 def order_of_tasks(root: Path) -> dict[int, str] | None:
     """task_index -> text, by rising numbers, as a dataset's table of tasks has them; None where the table is as LeRobot
     reads it: its index are the texts, and the n-th row has number n."""
+    _table(root / TASKS)
     table = pd.read_parquet(root / TASKS)
     texts = table.get("task", table.index)
     numbers = table["task_index"].tolist()
@@ -163,8 +246,9 @@ def read_info(root: Path) -> dict[str, Any]:
     if not isinstance(info.get("codebase_version"), str):
         refuse("codebase_version", info.get("codebase_version"), "a text, such as v3.0")
     for entry in ("data_path", "video_path"):
-        if info.get(entry) is not None and not _is_inner_path(info[entry]):
-            refuse(entry, info[entry], "a path inside the folder, of {chunk_index:03d}, {file_index:03d}, {video_key}")
+        known = FIELDS if info["codebase_version"].startswith("v3") else FIELDS + OLD_FIELDS
+        if info.get(entry) is not None and not _is_inner_path(info[entry], known):
+            refuse(entry, info[entry], f"a path inside the folder, of {', '.join(known)}")
     return info
 
 
@@ -172,17 +256,16 @@ def _is_count(value: Any, least: int, most: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
 
 
-def _is_inner_path(text: Any) -> bool:
+def _is_inner_path(text: Any, known: Sequence[str]) -> bool:
     """Whether a pattern of file names stays inside its folder, and has none but LeRobot's fields, short ones."""
     try:
         parts = list(Formatter().parse(text))
     except (TypeError, ValueError):
         return False
     fields = {name: form for _, name, form, _ in parts if name is not None}
-    known = {"chunk_index", "file_index", "video_key", "episode_chunk", "episode_index"}
     plain = all(re.fullmatch(r"(0?\d?d?)?", form or "") for form in fields.values())
     inner = not PurePosixPath(text).is_absolute() and ".." not in PurePosixPath(text.replace("\\", "/")).parts
-    return fields.keys() <= known and plain and inner and all(part[3] is None for part in parts)
+    return fields.keys() <= set(known) and plain and inner and all(part[3] is None for part in parts)
 
 
 def open_dataset(
@@ -199,15 +282,73 @@ def open_dataset(
     """
     if root is not None:
         check_folder(root)
-        check_format(root)
-    check_home()
-    repo_id = repo_id or LOCAL
-    dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, return_uint8=True)
+    name = repo_id or LOCAL
+    dataset = open_checked(
+        lambda: LeRobotDataset(name, root=root, episodes=episodes, return_uint8=True), root, name, episodes
+    )
     # The constructor takes seconds, which depend on the metadata; to read these twice takes as long as all the rest.
     dataset.delta_timestamps = resolve_delta_timestamps(config, dataset.meta)
     dataset.reader.delta_indices = get_delta_indices(dataset.delta_timestamps or {}, dataset.fps)
     read_cameras(dataset, config)
     return dataset
+
+
+def open_checked(
+    open_it: Callable[[], LeRobotDataset], root: Path | None, repo_id: str, episodes: Sequence[int] | None
+) -> LeRobotDataset:
+    """What a function opens, wherever LeRobot finds it: in a folder, by its name in LeRobot's home, or on the Hub.
+
+    Raises:
+        FileNotFoundError: files are missing, and cannot be fetched.
+        OSError: there is no place to write tables to.
+        ValueError: it is damaged, or of a format that LeRobot does not read.
+    """
+    check_home()
+    place = Path(root or HF_LEROBOT_HOME / repo_id)
+    there = (place / "meta" / "info.json").exists()
+    if there:
+        check_format(place)
+    try:
+        with sound_statistics():
+            dataset = open_it()
+    except (OSError, datasets.exceptions.DatasetGenerationError) as error:
+        if there:
+            check_whole(place, episodes)
+        if isinstance(error, OSError):
+            raise
+        raise ValueError(f"The tables of {repo_id} cannot be read ({error.__cause__}): fetch them anew.") from error
+    if not there:
+        check_format(Path(dataset.root))
+    return dataset
+
+
+@contextlib.contextmanager
+def sound_statistics() -> Iterator[None]:
+    """LeRobot ends in an error of numpy's or torch's where an entry of meta/stats.json is no mapping to numbers. In
+    here such entries are left out, also those of columns that no policy reads; what is read is computed."""
+    load = dataset_metadata.load_stats
+
+    def load_sound(root: Path) -> dict[str, dict[str, Any]] | None:
+        path = root / "meta" / "stats.json"
+        if not path.exists():
+            return None
+        found = read_json(path)
+        found = found if isinstance(found, dict) else {"all columns": found}
+        wrong = [key for key, known in found.items() if not are_statistics(known)]
+        if wrong:
+            _say_left_out(path, ", ".join(wrong))
+        return cast_stats_to_numpy({key: known for key, known in found.items() if key not in wrong})
+
+    vars(dataset_metadata)["load_stats"] = load_sound
+    try:
+        yield
+    finally:
+        vars(dataset_metadata)["load_stats"] = load
+
+
+@cache
+def _say_left_out(path: Path, columns: str) -> None:
+    logger.warning("%s holds for %s what are no statistics: what is read of them is computed.", path, columns)
 
 
 def bounds_of(dataset: LeRobotDataset) -> list[tuple[int, int]]:

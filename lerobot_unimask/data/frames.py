@@ -180,4 +180,7 @@ def _decode(dataset: LeRobotDataset, key: str, episode: int, rows: range, size: 
         return resized(frames, size)
     except Exception as error:  # torchcodec, PyAV and Pillow each raise their own
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise ValueError(f"{key} of episode {episode} does not decode ({reason[0][:200]}).") from error
+        raise ValueError(
+            f"{key} of episode {episode} in {dataset.root} does not decode ({reason[0][:200]}): fetch its file anew, "
+            "or leave the episode out with --dataset.episodes."
+        ) from error

@@ -25,6 +25,16 @@ def data_files(root: Path) -> list[Path]:
     return sorted((root / "data").glob("*/*.parquet"))
 
 
+def episode_files(root: Path) -> list[Path]:
+    """The tables of a dataset's episodes, in the order in which LeRobot reads them."""
+    return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+
+
+def episode_lengths(root: Path) -> np.ndarray:
+    """(E,) numbers of frames."""
+    return np.concatenate([pq.read_table(path, columns=["length"]).column("length") for path in episode_files(root)])
+
+
 def innermost(array: pa.Array) -> pa.Array:
     """What (nested) lists, or LeRobot's own types, hold, one number after another."""
     while isinstance(array, pa.ExtensionArray) or pa.types.is_nested(array.type):

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask.data.episodes import open_dataset
-from lerobot_unimask.measures import latency, measure
+from lerobot_unimask.measures import measure
 from lerobot_unimask.paper.study import Run, VariantsConfig, key, mean_over_seeds, run_study, write_results
 from lerobot_unimask.paper.study_tables import QUESTIONS, summary_table
 from lerobot_unimask.paper.table import maze_returns, mean_return
@@ -111,7 +111,6 @@ def execute(config: AblationConfig, run: Run) -> dict[str, Any]:
         **trainer.record(),
         "zero_hidden": run["row"] == config.zero_hidden,
         "processor_seconds_per_update": seconds / config.steps,
-        "latency": latency(policy),
         **measure(policy, open_dataset(policy.config, root), unseen[: config.measured_episodes], ahead=config.ahead),
     }
 
