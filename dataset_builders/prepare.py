@@ -31,6 +31,7 @@ from lerobot_unimask.data.episodes import (
     check_whole,
     is_type,
     order_of_tasks,
+    read_statistics,
 )
 from lerobot_unimask.data.factors import TEXTS, flat_names
 from lerobot_unimask.data.soundness import (
@@ -133,8 +134,7 @@ def make_plan(
     if not plan.convert:
         check_whole(root, without=plan.drop)
         check_tables(root, info, without=plan.drop)
-    stats = read_json(root / "meta" / "stats.json") if (root / "meta" / "stats.json").exists() else {}
-    stats = stats if isinstance(stats, Mapping) else {}
+    stats = read_statistics(root)
     for old, entry in features.items():
         new = plan.rename.get(old, old)
         if old in plan.drop:
@@ -275,9 +275,7 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
     found = {key: episode_statistics(columns[key], lengths) for key in plan.statistics if key in columns}
     for path in episode_files(source):
         rewrite(path, partial / path.relative_to(source), lambda table: _episodes_table(table, plan, found))
-    path = source / "meta" / "stats.json"
-    found_stats = read_json(path) if path.exists() else {}
-    old_stats = found_stats if isinstance(found_stats, Mapping) else {}
+    old_stats = read_statistics(source)
     stats = {plan.rename.get(k, k): v for k, v in old_stats.items() if k not in plan.drop and are_statistics(v)}
     for key, statistics in found.items():
         stats[key] = {name: value.tolist() for name, value in dataset_statistics(statistics).items()}

@@ -329,15 +329,11 @@ def sound_statistics() -> Iterator[None]:
     load = dataset_metadata.load_stats
 
     def load_sound(root: Path) -> dict[str, dict[str, Any]] | None:
-        path = root / "meta" / "stats.json"
-        if not path.exists():
-            return None
-        found = read_json(path)
-        found = found if isinstance(found, dict) else {"all columns": found}
+        found = read_statistics(root)
         wrong = [key for key, known in found.items() if not are_statistics(known)]
         if wrong:
-            _say_left_out(path, ", ".join(wrong))
-        return cast_stats_to_numpy({key: known for key, known in found.items() if key not in wrong})
+            _say_left_out(root, ", ".join(wrong))
+        return cast_stats_to_numpy({key: known for key, known in found.items() if key not in wrong}) or None
 
     vars(dataset_metadata)["load_stats"] = load_sound
     try:
@@ -347,8 +343,15 @@ def sound_statistics() -> Iterator[None]:
 
 
 @cache
-def _say_left_out(path: Path, columns: str) -> None:
-    logger.warning("%s holds for %s what are no statistics: what is read of them is computed.", path, columns)
+def _say_left_out(root: Path, columns: str) -> None:
+    logger.warning("%s holds for %s what are no statistics: what is read of them is computed.", root, columns)
+
+
+def read_statistics(root: Path) -> dict[str, Any]:
+    """What a dataset's meta/stats.json holds of each column; empty where it is absent or no mapping."""
+    path = root / "meta" / "stats.json"
+    found = read_json(path) if path.exists() else {}
+    return found if isinstance(found, dict) else {}
 
 
 def bounds_of(dataset: LeRobotDataset) -> list[tuple[int, int]]:
