@@ -1,4 +1,4 @@
-"""LeRobot's own policies on a task of MetaWorld's arm: trained for so many processor seconds, then rolled out.
+"""LeRobot's own policies on a task of MetaWorld's arm, trained for so much time or so many updates, then rolled out.
 
     OMP_NUM_THREADS=1 uv run python tests/measuring/arm_others.py --root=data/peg --policy=act --seconds=130 \
         --settings='{"dim_model": 128}' --output=docs/results/FILE.json
@@ -10,8 +10,10 @@ will be is not known. `diffusion` needs LeRobot's extra of that name. Episodes s
 
 import argparse
 import json
+import math
 import resource
 import time
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +51,7 @@ class Acting:
 
 
 def train(arguments: argparse.Namespace) -> tuple[Acting, dict[str, Any]]:
-    """A policy trained until its time is spent, and what the record says of that."""
+    """A policy trained until its time is spent or its updates are made, and what the record says of that."""
     set_seed(arguments.seed)
     keep_freed_memory()
     config = make_policy_config(arguments.policy, device="cpu", push_to_hub=False, **arguments.settings)
@@ -68,18 +70,16 @@ def train(arguments: argparse.Namespace) -> tuple[Acting, dict[str, Any]]:
         seed=arguments.seed,
     )
     loader = torch.utils.data.DataLoader(dataset, batch_size=arguments.batch_size, sampler=sampler)
-    updates, began = 0, time.process_time()
+    updates, spent, began = 0, 0.0, time.process_time()
     policy.train()
-    while time.process_time() - began < arguments.seconds:
-        for batch in loader:
-            policy.forward(before(batch))[0].backward()
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), preset.grad_clip_norm)
-            optimizer.step()
-            optimizer.zero_grad()
-            updates += 1
-            if time.process_time() - began >= arguments.seconds:
-                break
-    spent = time.process_time() - began
+    for batch in chain.from_iterable(repeat(loader)):  # another order in each epoch
+        policy.forward(before(batch))[0].backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), preset.grad_clip_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+        updates, spent = updates + 1, time.process_time() - began
+        if spent >= arguments.seconds or updates == arguments.updates:
+            break
     facts = {
         "updates": updates,
         "train_processor_seconds": round(spent, 1),
@@ -110,7 +110,8 @@ def main() -> None:
     parser.add_argument("--root", type=Path, required=True, help="a dataset of `unimask build metaworld`, of one task")
     parser.add_argument("--policy", required=True, help="a type of LeRobot's, such as act")
     parser.add_argument("--settings", type=json.loads, default={}, help="of the policy; default: none changed")
-    parser.add_argument("--seconds", type=float, required=True, help="processor time of the training")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="processor time of the training; default: any")
+    parser.add_argument("--updates", type=int, help="of the training; default: as many as its time allows")
     parser.add_argument("--batch_size", type=int, default=32)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=50, help="0: none, where acting takes too long")
@@ -126,7 +127,7 @@ def main() -> None:
         facts |= success(acting, envs, arguments.starts)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     run = {"policy": arguments.policy, "task": task, **facts, "memory_gib": round(memory, 2)}
-    run["command"] = {name: str(value) for name, value in vars(arguments).items()}
+    run["command"] = {name: str(value) for name, value in vars(arguments).items() if value is not None}
     runs = read_json(arguments.output)["runs"] if arguments.output.exists() else []
     write_json(
         arguments.output,
