@@ -155,7 +155,7 @@ class UniMASKConfig(PreTrainedConfig):
     """Whether the return and properties are predicted too: rtg[0] | s[:t+1]. None: yes, but for attention=causal."""
     discrete_head: str | None = None
     """What is predicted of a token's discrete numbers: "joint", one distribution over all combinations of their
-    categories, where there are at most 1,024, or "separate", the paper's: one for each number. None: joint; in a
+    categories (up to 16,384; more are divided), or "separate", the paper's: one for each number. None: joint; in a
     checkpoint of format 2 or older, separate."""
     continuous_head: str = "gaussian"
     """What is predicted of continuous values: "gaussian", a mean and a scale for each number; "mixture", several

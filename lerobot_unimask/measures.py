@@ -113,7 +113,7 @@ def disagreement(policy: UniMASKPolicy, batch: dict[str, Tensor], question: str)
 def _divergence(p: Tensor, q: Tensor, output: Output) -> Tensor:
     """(B, size) of two networks' outputs -> (B,); of mixtures, that of draws, for it has no closed form."""
     if output.discrete:
-        p, q = p.log_softmax(-1), q.log_softmax(-1)
+        p, q = output.table(p).log_softmax(-1), output.table(q).log_softmax(-1)
         return (p.exp() * (p - q)).sum(-1)
     if not output.gaussians:
         return (p - q).square().sum(-1) / 2

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from lerobot_unimask.data.factors import Factor, Output
+from lerobot_unimask.data.factors import LINK, Factor, Output
 from lerobot_unimask.data.window import Window
 from lerobot_unimask.language.masks import ASKABLE
 from lerobot_unimask.networks.layers import Predictions, marginals
@@ -55,6 +55,8 @@ def output_loss(prediction: Tensor, value: Tensor, output: Output) -> Tensor:
         fiftieth of a standard deviation pulls fifty times as hard as what is not, and a model that learns where the
         mass goes is slow to learn what moves it (docs/experiments.md).
     """
+    if output.chained:
+        return _chain_loss(prediction, value, output)
     if output.discrete:
         return functional.cross_entropy(prediction.transpose(1, 2), output.combination(value), reduction="none")
     target = value[..., output.dims]
@@ -66,6 +68,17 @@ def output_loss(prediction: Tensor, value: Tensor, output: Output) -> Tensor:
         cost = constant + scales.detach().exp() * (cost - constant)
         return -(logits.log_softmax(-1) - cost.sum(-1)).logsumexp(-1) / target.shape[-1]
     return (prediction - target).square().mean(-1)
+
+
+def _chain_loss(prediction: Tensor, value: Tensor, output: Output) -> Tensor:
+    """Cross-entropy by the chain rule, (B, K): that of `Output.table`, of which it computes what was true alone."""
+    cost, told = torch.zeros_like(prediction[..., 0]), prediction.new_zeros(LINK)
+    for component, (logits, vectors) in zip(output.components, output.links(prediction), strict=True):
+        true = value[..., component.dims.start].long().unsqueeze(-1)  # (B, K, 1)
+        given = (logits + (vectors * told).sum(-1)).log_softmax(-1)
+        cost = cost - given.gather(-1, true).squeeze(-1)
+        told = told + vectors.take_along_dim(true.unsqueeze(-1), -2)  # (B, K, 1, LINK)
+    return cost
 
 
 def token_count(asked: Tensor) -> Tensor:

@@ -8,11 +8,12 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy
-from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, assert_same_answers, random_question, roll
+from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, LAYOUTS, SMALL, assert_same_answers, random_question, roll
 from safetensors.torch import load_file, save_file
 
-from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask import UniMASKConfig, UniMASKPolicy
 from lerobot_unimask.data.checkpoints import checkpoints_of, last_checkpoint
+from lerobot_unimask.data.factors import Feature
 
 
 def test_a_loaded_policy_gives_the_same_answers(kind, layout, tiny_policy, batch_of, tmp_path, states):
@@ -276,6 +277,18 @@ def test_separate_heads_go_on_as_joint_ones_that_answer_the_same(network, tiny_p
     assert [output.size for output in loaded.factors["s"].outputs] == [256]
     window, mask = random_question(policy, doorkey_batch, 0)
     assert_same_answers(loaded.infer(window, mask), policy.infer(window, mask), exactly=False)
+
+
+def test_separate_heads_go_on_as_a_chain_that_answers_the_same(tmp_path):
+    features = {"s": [Feature("observation.state", 3, [40, 3, 20])], "a": [Feature("action", 1, [4])]}
+    policy = UniMASKPolicy(UniMASKConfig(**SMALL, features=features, discrete_head="separate")).eval()
+    policy.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.discrete_head = "joint"
+    loaded = UniMASKPolicy.from_pretrained(tmp_path, config=config).eval()
+    assert [output.chained for output in loaded.factors["s"].outputs] == [True]
+    question = {"mask": "s[1], a[2] | s[0], a[0]", "given": {"s[0]": [39, 1, 5], "a[0]": 3}}
+    assert_same_answers(loaded.infer(None, **question), policy.infer(None, **question), exactly=False)
 
 
 @pytest.mark.parametrize("network", ["transformer", "feedforward"])

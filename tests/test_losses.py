@@ -101,6 +101,43 @@ def test_a_joint_predictions_marginals_cost_what_tables_say():
         assert part.shape == (B, K, size)
 
 
+CHAIN = make_factors({"s": [Feature("observation.state", 3, [40, 3, 20])]}, joint=True)["s"].outputs[0]
+
+
+def test_a_chain_is_the_product_of_each_number_given_those_before_it():
+    """Its table and its loss against a loop over the chain."""
+    generator = torch.Generator().manual_seed(0)
+    prediction = 3 * torch.randn(2, 1, CHAIN.size, generator=generator)
+    table = CHAIN.table(prediction).view(2, 40, 3, 20)
+    torch.testing.assert_close(table.exp().sum((1, 2, 3)), torch.ones(2))
+    for combination in ((0, 0, 0), (39, 2, 19), (7, 1, 12)):
+        for b in range(2):
+            log, told, start = 0.0, torch.zeros(16), 0
+            for value, count in zip(combination, CHAIN.categories, strict=True):
+                link = prediction[b, 0, start : start + 17 * count].view(count, 17)
+                logits = [(link[c, 0] + (link[c, 1:] / 2) @ (told / 2)).item() for c in range(count)]
+                log += logits[value] - math.log(sum(map(math.exp, logits)))
+                told, start = told + link[value, 1:], start + 17 * count
+            assert table[b, *combination].item() == pytest.approx(log, rel=1e-4)
+        value = torch.tensor(combination).float().expand(2, 1, 3)
+        torch.testing.assert_close(output_loss(prediction, value, CHAIN)[:, 0], -table[:, *combination])
+
+
+def test_a_chain_learns_numbers_that_belong_together():
+    """Each of the 40 with one of the 20 and with one of the 3: separately they cost three times as much."""
+    first = torch.arange(40).float()
+    value = torch.stack([first, first % 3, (7 * first) % 20], dim=-1).unsqueeze(1)  # (40, 1, 3)
+    prediction = torch.nn.Parameter(0.1 * torch.randn(CHAIN.size, generator=torch.Generator().manual_seed(0)))
+    optimizer = torch.optim.Adam([prediction], lr=0.1)
+    for _ in range(200):
+        loss = output_loss(prediction.expand(40, 1, -1), value, CHAIN).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss.item() == pytest.approx(math.log(40), abs=0.05)
+    assert CHAIN.table(prediction.detach()).softmax(-1)[CHAIN.combination(value[:, 0])].sum() > 0.95
+
+
 def test_a_gaussians_scale_is_bounded():
     output = make_factors(FEATURES, gaussians=1)["a"].outputs[0]
     value = torch.tensor([[[1.0, -1.0]]])

@@ -1,5 +1,7 @@
 """Windows from LeRobot batches, and the statistics that turn their units."""
 
+import math
+
 import pytest
 import torch
 
@@ -61,9 +63,27 @@ def test_discrete_numbers_of_a_token_make_one_output_where_their_combinations_ar
     values = torch.cartesian_prod(torch.arange(16), torch.arange(8))
     assert torch.equal(cells.combination(values), torch.arange(128))
     assert torch.equal(cells.split(torch.arange(128)), values)
-    for categories, sizes in (([32, 32], [1024]), ([32, 33], [32, 33]), ([1024], [1024])):
-        features = {"s": [Feature("observation.state", len(categories), categories)]}
-        assert [output.size for output in make_factors(features, joint=True)["s"].outputs] == sizes
+
+
+@pytest.mark.parametrize(
+    ("categories", "together"),
+    [
+        ([32, 32], [[32, 32]]),
+        ([32, 33], [[32, 33]]),
+        ([5000], [[5000]]),
+        ([128, 128, 2], [[128, 128], [2]]),
+        ([11] * 6, [[11] * 4, [11] * 2]),
+    ],
+)
+def test_as_many_discrete_numbers_as_can_be_told_are_predicted_together(categories, together):
+    features = {"s": [Feature("observation.state", len(categories), categories)]}
+    outputs = make_factors(features, joint=True)["s"].outputs
+    assert [list(output.categories) for output in outputs] == together
+    for output in outputs:
+        count = math.prod(output.categories)
+        chained = len(output.components) > 1 and count > 1024
+        assert output.size == (sum(output.categories) * 17 if chained else count)
+        assert output.table(torch.zeros(2, output.size)).shape == (2, count)
 
 
 def test_a_window_holds_the_batchs_numbers():

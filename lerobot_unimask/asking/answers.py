@@ -308,9 +308,10 @@ def answer(
         for prediction, output in zip(predictions[name], model.factors[name].outputs, strict=True):
             prediction = prediction.float()  # also under autocast, or probabilities would not sum to one
             if output.discrete:
+                probabilities = output.table(prediction).softmax(-1)
                 certain = output.combination(torch.where(shown, window.values[name], 0.0))
-                certain = functional.one_hot(certain, output.size).to(prediction.dtype)
-                probabilities = torch.where(shown, certain, prediction.softmax(-1))
+                certain = functional.one_hot(certain, probabilities.shape[-1]).to(prediction.dtype)
+                probabilities = torch.where(shown, certain, probabilities)
                 probabilities = torch.where(known, probabilities, torch.nan)
                 distributions[name].append(DiscreteDistribution(output, probabilities))
             else:

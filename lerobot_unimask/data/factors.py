@@ -22,7 +22,9 @@ TASK = "task"  # LeRobot's name for what an episode is to do, a text; here the f
 
 TEXTS = ("string", "language")  # LeRobot's types of columns that hold no numbers, beside pictures
 MAX_SIZE = 65536  # numbers of a column, categories of a number: more is a damaged file
-MAX_JOINT = 1024  # combinations of categories that one distribution is over; beyond, each number has its own
+MAX_JOINT = 1024  # combinations of categories that have a logit each; beyond, their components are chained
+MAX_CHAIN = 16_384  # combinations of components that are chained; an answer is a table of them
+LINK = 16  # numbers by which a chained category tells later components that it was drawn
 LOG_SCALE = (-7.0, 7.0)  # a Gaussian head's scales stay within e^-7 to e^7 standard deviations of the data
 
 
@@ -79,7 +81,12 @@ class Component:
 class Output:
     """What a network predicts of a token in one piece: discrete components together, as one distribution over all
     combinations of their categories; or continuous ones, as a mean, or as Gaussians, each with a weight and with means
-    and scales of all numbers."""
+    and scales of all numbers.
+
+    Where there are more than `MAX_JOINT` combinations, the distribution is a chain, the product of each component's
+    given those before it. Of each category a logit and a vector are predicted; to the logits of a component are added
+    the products of its categories' vectors with the sum of the vectors of what the components before it are.
+    """
 
     components: tuple[Component, ...]
     gaussians: int = 0  # 0: a mean
@@ -87,6 +94,10 @@ class Output:
     @property
     def discrete(self) -> bool:
         return self.components[0].discrete
+
+    @property
+    def chained(self) -> bool:
+        return self.discrete and len(self.components) > 1 and math.prod(self.categories) > MAX_JOINT
 
     @property
     def apart(self) -> "list[Output]":
@@ -111,7 +122,10 @@ class Output:
 
     @property
     def size(self) -> int:
-        """Of a prediction: logits of the combinations; or the parts that `unpack` makes of it."""
+        """Of a prediction: logits of the combinations, or the links of a chain; or the parts that `unpack` makes of
+        it."""
+        if self.chained:
+            return sum(self.categories) * (1 + LINK)
         if self.discrete:
             return math.prod(self.categories)
         return sum(self._parts)
@@ -136,6 +150,27 @@ class Output:
         """What `unpack` unpacks."""
         parts = (logits, means.flatten(-2), scales.flatten(-2))
         return torch.cat([part for part, size in zip(parts, self._parts, strict=True) if size], dim=-1)
+
+    def links(self, prediction: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """A chained prediction, (..., size) -> logits (..., C) and vectors (..., C, LINK) of each component's C
+        categories."""
+        parts = prediction.split([count * (1 + LINK) for count in self.categories], dim=-1)
+        tables = [part.unflatten(-1, (-1, 1 + LINK)) for part in parts]
+        return [(table[..., 0], table[..., 1:] * LINK**-0.25) for table in tables]  # as attention scales its products
+
+    def table(self, prediction: Tensor) -> Tensor:
+        """A discrete prediction, (..., size), as logits of all combinations, (..., C)."""
+        if not self.chained:
+            return prediction
+        logs = torch.zeros_like(prediction[..., :1])  # (..., combinations so far)
+        told = logs.unsqueeze(-1).expand(*logs.shape, LINK)  # (..., combinations so far, LINK)
+        earlier: Tensor | None = None
+        for logits, vectors in self.links(prediction):
+            if earlier is not None:
+                told = (told.unsqueeze(-2) + earlier.unsqueeze(-3)).flatten(-3, -2)
+            given = (logits.unsqueeze(-2) + told @ vectors.transpose(-1, -2)).log_softmax(-1)
+            logs, earlier = (logs.unsqueeze(-1) + given).flatten(-2), vectors
+        return logs
 
     def combination(self, values: Tensor) -> Tensor:
         """The discrete values of tokens, (..., D), as numbers of combinations, (...); the last category runs first."""
@@ -193,7 +228,7 @@ def make_factors(
     """The model's factors from the features that its config stores under each name.
 
     Args:
-        joint: predict a token's discrete components as one distribution, where it is over at most `MAX_JOINT`
+        joint: predict a token's discrete components as one distribution, or as several, each over at most `MAX_CHAIN`
             combinations; otherwise each by itself.
         gaussians: number of Gaussians that continuous components are predicted as: 0, just a mean; 1, a mean and a
             scale for each number; more, a mixture over all of a token's continuous numbers.
@@ -221,9 +256,14 @@ def make_factors(
 def _outputs(components: Sequence[Component], *, joint: bool, gaussians: int) -> tuple[Output, ...]:
     discrete = [component for component in components if component.discrete]
     continuous = [component for component in components if not component.discrete and not component.computed]
-    together = joint and math.prod(c.categories or 1 for c in discrete) <= MAX_JOINT
-    groups = [discrete] if together else [[component] for component in discrete]
-    outputs = [Output(tuple(group)) for group in groups if group]
+    groups: list[list[Component]] = []
+    for component in discrete:
+        together = math.prod(c.categories or 1 for c in [*groups[-1], component]) if groups else math.inf
+        if joint and together <= MAX_CHAIN:
+            groups[-1].append(component)
+        else:
+            groups.append([component])
+    outputs = [Output(tuple(group)) for group in groups]
     groups = [continuous] if gaussians > 1 else [[component] for component in continuous]
     return tuple(outputs + [Output(tuple(group), gaussians) for group in groups if group])
 

@@ -37,15 +37,23 @@ def fitted(
     before, factors = saved.make_factors(), config.make_factors()
     new = {name for name in factors if name not in before}
     new_heads = set(config.predicted(factors)) - set(saved.predicted(before))
-    return {**weights, **joined(weights, before, factors), **grown(weights, drawn, list(factors), new, new_heads)}
+    return {
+        **weights,
+        **joined(weights, before, factors, drawn),
+        **grown(weights, drawn, list(factors), new, new_heads),
+    }
 
 
 def joined(
-    weights: Mapping[str, Tensor], saved: Mapping[str, Factor], wanted: Mapping[str, Factor]
+    weights: Mapping[str, Tensor],
+    saved: Mapping[str, Factor],
+    wanted: Mapping[str, Factor],
+    drawn: Mapping[str, Tensor],
 ) -> dict[str, Tensor]:
     """A checkpoint's heads as those that training goes on with. Separate heads become joint ones, which at first answer
-    the same: the logit of a combination is the sum of its categories'. Gaussians become a mixture whose parts begin at
-    their means, each with another scale, so that the parts can come to differ. Of heads that are as wanted, nothing."""
+    the same: the logit of a combination is the sum of its categories'; in a chain the first component's vectors are
+    `drawn`, and the others' are 0. Gaussians become a mixture whose parts begin at their means, each with another
+    scale, so that the parts can come to differ. Of heads that are as wanted, nothing."""
     heads: dict[str, Tensor] = {}
     for key, rows in weights.items():
         found = re.fullmatch(r"network\.heads\.(\w+)\.(weight|bias)", key)
@@ -55,8 +63,12 @@ def joined(
         sizes = [output.size for output in outputs]
         parts = rows.unflatten(0, (-1, sum(sizes))).split(sizes, dim=1)  # (steps, size, ...) each
         of_number = {output.numbers[0]: part for output, part in zip(outputs, parts, strict=True)}
-        whole = []
-        for output in wanted[found[1]].outputs:
+        wanted_outputs, whole = wanted[found[1]].outputs, []
+        begun = drawn[key].unflatten(0, (len(parts[0]), -1)).split([output.size for output in wanted_outputs], dim=1)
+        for output, fresh in zip(wanted_outputs, begun, strict=True):
+            if output.chained:
+                whole.append(_begin_chain([of_number[number] for number in output.numbers], fresh))
+                continue
             total, *others = (of_number[number] for number in output.numbers if number in of_number)
             if output.gaussians > 1 and outputs[-1].gaussians == 1:
                 total = _begin_mixture([total, *others], output.gaussians, bias=found[2] == "bias")
@@ -66,6 +78,16 @@ def joined(
             whole.append(total)
         heads[key] = torch.cat(whole, dim=1).flatten(0, 1)
     return heads
+
+
+def _begin_chain(separate: Sequence[Tensor], drawn: Tensor) -> Tensor:
+    """The rows of a head that predicts a chain, (steps, size, ...), from those of one for each component."""
+    counts = [rows.shape[1] for rows in separate]
+    parts = drawn.unflatten(1, (sum(counts), -1)).split(counts, dim=1)  # (steps, C, 1 + LINK, ...) each
+    links = [part * (i == 0) for i, part in enumerate(parts)]
+    for logits, link in zip(separate, links, strict=True):
+        link[:, :, 0] = logits
+    return torch.cat(links, dim=1).flatten(1, 2)
 
 
 def _begin_mixture(gaussians: Sequence[Tensor], count: int, *, bias: bool) -> Tensor:

@@ -210,7 +210,7 @@ def marginals(prediction: Tensor, output: Output) -> list[Tensor]:
         sizes = [len(part.numbers) for part in output.apart]
         pairs = zip(output.apart, means.split(sizes, dim=-1), scales.split(sizes, dim=-1), strict=True)
         return [part.pack(logits, *of_numbers) for part, *of_numbers in pairs]
-    table = prediction.unflatten(-1, output.categories)
+    table = output.table(prediction).unflatten(-1, output.categories)
     axes = range(-len(output.categories), 0)
     return [table.logsumexp([other for other in axes if other != axis]) for axis in axes]
 
