@@ -58,7 +58,10 @@ def _add_chunks(parts: Any) -> None:
 
     goals = add_command(parts, "goals", "Maze2D with --hide_goal=true: told of the goal by s[-1] alone, at every step")
     policy_flags(goals)
-    goals.add_argument("--dataset.root", type=Path, required=True, dest="data", metavar="DIR", help="its episodes")
+    goals.add_argument("--maze", default="medium", help="that of its episodes")
+    goals.add_argument("--chunk_size", type=positive, action="append", required=True, dest="sizes", help="H; several")
+    goals.add_argument("--mask", default="goal_conditioned", help="the question that shows s[-1]; default: %(default)s")
+    goals.add_argument("--n_action_steps", type=positive, default=1, help="actions of a chunk that are carried out")
     goals.add_argument("--episodes", type=positive, default=200, help="rollouts of each way of showing the goal")
     goals.add_argument("--seed", type=int, default=100_000, help="of the first rollout's start")
     output_flag(goals)
@@ -148,7 +151,15 @@ def _goals(arguments: argparse.Namespace) -> None:
     from lerobot_unimask.paper.chunks import measure_goals
     from lerobot_unimask.paper.study_tables import goals_table
 
-    _measure_acting(arguments, measure_goals, goals_table, data=arguments.data, chunk_sizes=(8, 15))
+    _measure_acting(
+        arguments,
+        measure_goals,
+        goals_table,
+        maze=arguments.maze,
+        chunk_sizes=arguments.sizes,
+        mask=arguments.mask,
+        n_action_steps=arguments.n_action_steps,
+    )
 
 
 def _tasks(arguments: argparse.Namespace) -> None:

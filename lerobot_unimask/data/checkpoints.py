@@ -62,7 +62,8 @@ def _train_config(checkpoint: str | Path) -> dict[str, Any] | None:
 
 
 def training_settings(checkpoint: str | Path | None) -> dict[str, Any] | None:
-    """What lerobot-train saved beside the weights: the policy's settings, the seed, the data and its provenance."""
+    """What lerobot-train saved beside the weights: the policy's settings, the seed, the data and its provenance but for
+    what that says of each episode."""
     config = _train_config(checkpoint) if checkpoint is not None else None
     if config is None:
         return None
@@ -73,8 +74,9 @@ def training_settings(checkpoint: str | Path | None) -> dict[str, Any] | None:
     }
     for unrelated in ("input_features", "output_features", "features", "normalization_mapping", "pretrained_path"):
         policy.pop(unrelated, None)
-    provenance = provenance_of(Path(root)) or None if root else None
-    return {**{key: config[key] for key in keep}, "policy": policy, "data": provenance}
+    provenance = provenance_of(Path(root)) if root else {}
+    data = {key: value for key, value in provenance.items() if not isinstance(value, list)}
+    return {**{key: config[key] for key in keep}, "policy": policy, "data": data or None}
 
 
 def episodes_trained_on(checkpoint: str | Path | None, root: Path, repo_id: str | None, count: int) -> list[int]:

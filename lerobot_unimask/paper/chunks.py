@@ -1,5 +1,5 @@
 """Acting in Maze2D: what chunks and real-time chunking return and cost, and how far actions jump between chunks; what
-comes of goals a few steps ahead, and of tasks that are asked for or hidden.
+comes of goals that last, and of tasks that are asked for or hidden.
 
 Legend of shapes: B environments, T steps, H actions of a chunk, D the numbers of an action.
 """
@@ -17,11 +17,10 @@ from torch import Tensor
 
 from lerobot_unimask.asking.acting import new_memory, plan
 from lerobot_unimask.envs.maze2d.environment import Maze2DEnv
-from lerobot_unimask.envs.maze2d.expert import next_cells
-from lerobot_unimask.envs.maze2d.maze import HORIZON, task_of
+from lerobot_unimask.envs.maze2d.maze import HORIZON, SUCCESS_DISTANCE, task_of
 from lerobot_unimask.evaluating import rollout
 from lerobot_unimask.modeling_unimask import UniMASKPolicy
-from lerobot_unimask.paper.study_tables import acting_table, real_time_table
+from lerobot_unimask.paper.study_tables import SHOWN, acting_table, real_time_table
 from lerobot_unimask.records import versions
 
 AGAIN = 4  # steps from one request for a chunk to the next, or the delay if it is longer
@@ -129,34 +128,31 @@ def _ask(policy: UniMASKPolicy, states: np.ndarray, delay: int, left: Tensor | N
 
 
 def measure_goals(
-    checkpoint: Path, data: Path, *, episodes: int, chunk_sizes: Sequence[int], seed: int
+    checkpoint: Path, maze: str, *, episodes: int, chunk_sizes: Sequence[int], mask: str, n_action_steps: int, seed: int
 ) -> dict[str, Any]:
     """A JSON record: rollouts of a policy whose state is the position without the goal, which is told of the goal by
     s[-1] alone, H - 1 steps from now at every step, beside imitation, which is told nothing.
 
     Args:
-        data: folder of its dataset, which says how far the mass comes in H - 1 steps.
+        maze: that of its episodes, a name or a text.
         episodes: rollouts of each way, all from the same starts.
-        chunk_sizes: H; the last counts for goals of one moment of the episode too.
+        chunk_sizes: H; with the first one nothing and another rollout's goal are shown too.
+        mask: the question that shows s[-1].
+        n_action_steps: actions of a chunk that are carried out.
     """
-    policy = UniMASKPolicy.from_pretrained(checkpoint)
-    frames = pyarrow.dataset.dataset(data / "data", format="parquet").to_table(["observation.state"])
-    positions = np.stack(frames["observation.state"].to_numpy()).reshape(-1, HORIZON, 2)
-    rows = []
-    for size in (1, *chunk_sizes):
-        far = (
-            0.0
-            if size == 1
-            else float(np.linalg.norm(positions[:, size - 1 :] - positions[:, : 1 - size], axis=-1).mean())
-        )
-        ways = ("nothing",) if size == 1 else ("goal", "straight", "walk")
-        for shown in (*ways, "moment") if size == chunk_sizes[-1] else ways:
-            policy.config.chunk_size = size
-            found = act_towards_goals(policy, episodes, shown, far, seed=seed)
-            rows.append({"chunk_size": size, "shown": shown, "cells": far, **found})
-            print(f"H = {size}, shown {shown}, within {far:.2f} cells: {found}", flush=True)
+    policy, rows = UniMASKPolicy.from_pretrained(checkpoint), []
+    policy.config.n_action_steps = n_action_steps
+    for size in chunk_sizes:
+        policy.config.chunk_size = size
+        for shown in SHOWN if size == chunk_sizes[0] else ("goal",):
+            found = act_towards_goals(policy, episodes, maze, shown, mask, seed=seed)
+            rows.append({"chunk_size": size, "shown": shown, **found})
+            print(f"H = {size}, shown {shown}: {found}", flush=True)
     return {
         "goals": rows,
+        "maze": maze,
+        "mask": mask,
+        "n_action_steps": n_action_steps,
         "episodes": episodes,
         "seed": seed,
         "policy": policy.describe_origin(),
@@ -165,43 +161,35 @@ def measure_goals(
 
 
 @torch.no_grad()
-def act_towards_goals(policy: UniMASKPolicy, episodes: int, shown: str, far: float, *, seed: int) -> dict[str, float]:
-    """Rollouts, one action after another.
+def act_towards_goals(
+    policy: UniMASKPolicy, episodes: int, maze: str, shown: str, mask: str, *, seed: int
+) -> dict[str, float]:
+    """Rollouts, one beside another.
 
     Args:
-        shown: as s[-1] "nothing"; the "goal"; the point at most `far` on the way to it, "straight" or from cell to cell
-            on the shortest "walk"; or the goal for one "moment" of the episode, its last step.
-        far: cells.
+        shown: a key of `SHOWN`.
 
     Returns:
-        mean return, its standard error, and the share of successes.
+        mean return, its standard error, the share of successes, and the share that comes as near to what is shown.
     """
-    environments = [Maze2DEnv(render_mode=None, hide_goal=True) for _ in range(episodes)]
+    environments = [Maze2DEnv(maze, render_mode=None, hide_goal=True) for _ in range(episodes)]
     positions = np.stack([env.reset(seed=seed + i)[0]["agent_pos"] for i, env in enumerate(environments)])
     goals, returns = np.array([env.goal for env in environments], np.float32), np.zeros(episodes)
+    there = np.roll(goals, 1, axis=0) if shown == "other" else goals
+    nearest = np.full(episodes, np.inf)
+    question: dict[str, Any] = {"mask": "behavior_cloning", "given": {}}
+    if shown != "nothing":
+        question = {"mask": mask, "given": {"s[-1]": torch.from_numpy(there)}}
     policy.reset()
     for _ in range(HORIZON):
-        question: dict[str, Any] = {}
-        if shown == "moment":
-            question["given"] = {f"s@{HORIZON - 1}": torch.from_numpy(goals)}
-        elif shown != "nothing":
-            aims = goals if shown != "walk" else np.array([_next_on_walk(env) for env in environments], np.float32)
-            way = aims - positions
-            shorter = np.minimum(1, far / np.linalg.norm(way, axis=1, keepdims=True).clip(1e-6))
-            there = goals if shown == "goal" else positions + way * shorter
-            question = {"mask": "goal_conditioned", "given": {"s[-1]": torch.from_numpy(there)}}
         actions = policy.select_action({"observation.state": torch.from_numpy(positions)}, **question)
         results = [env.step(one) for env, one in zip(environments, actions.numpy(), strict=True)]
         positions = np.stack([result[0]["agent_pos"] for result in results])
         returns += [result[1] for result in results]
+        nearest = np.minimum(nearest, np.linalg.norm(positions - there, axis=1))
     success = np.mean([result[4]["is_success"] for result in results]).item()
-    return {**_spread(torch.from_numpy(returns)), "success": success}
-
-
-def _next_on_walk(env: Maze2DEnv) -> tuple[int, int]:
-    """The next cell of the shortest walk to the goal, or the goal."""
-    nearest = min(env.maze.cells, key=lambda cell: np.hypot(cell[0] - env.position[0], cell[1] - env.position[1]))
-    return next_cells(env.maze, env.goal).get(nearest, env.goal)
+    reached = {} if shown == "nothing" else {"there": float((nearest <= SUCCESS_DISTANCE).mean())}
+    return {**_spread(torch.from_numpy(returns)), "success": success, **reached}
 
 
 def measure_tasks(

@@ -157,9 +157,7 @@ def acting_table(record: Mapping[str, Any]) -> str:
 SHOWN = {  # as s[-1], by its name in the record
     "nothing": "nothing: imitation",
     "goal": "the goal",
-    "straight": "towards it, {cells:.2f} cells from here",
-    "walk": "on the shortest walk, {cells:.2f} cells from here",
-    "moment": "the goal, as `s@199`",
+    "other": "another rollout's goal",
 }
 
 
@@ -167,13 +165,14 @@ def goals_table(record: Mapping[str, Any]) -> str:
     rows = (
         (
             row["chunk_size"],
-            SHOWN[row["shown"]].format(**row),
+            SHOWN[row["shown"]],
             _returned(row),
             f"{row['success']:.3f}",
+            f"{row['there']:.3f}" if "there" in row else "",
         )
         for row in record["goals"]
     )
-    return markdown_table(("H", "shown as `s[-1]`", "return", "success"), rows)
+    return markdown_table(("H", "shown as `s[-1]`", "return", "success", "comes there"), rows)
 
 
 def tasks_table(record: Mapping[str, Any]) -> str:
