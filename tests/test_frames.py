@@ -61,23 +61,39 @@ def test_equal_to_what_lerobot_reads(recorded, size, episodes, tmp_path):
 
 def test_grey_pictures_have_the_channels_that_lerobot_reads(recorded, tmp_path):
     """A video whose description says one channel is read with three; stored pictures of one channel with one."""
-    root = shutil.copytree(recorded, tmp_path / "grey")
+    dataset = opened(converted(recorded, tmp_path, "L", 1))
+    assert np.array_equal(frames.cached_frames(dataset, KEY, (SIDE, SIDE), tmp_path / "cache"), read(dataset).numpy())
+
+
+@pytest.mark.parametrize("recorded", ["image"], indirect=True)
+@pytest.mark.parametrize(("mode", "channels"), [("I;16", 1), ("I", 1), ("RGBA", 3)])
+def test_pictures_of_more_bits_or_channels_are_refused(recorded, tmp_path, mode, channels):
+    """As depth that is not said to be depth; it would be read as numbers that have gone round."""
+    dataset = opened(converted(recorded, tmp_path, mode, channels))
+    with pytest.raises(ValueError, match=rf"{KEY} of episode 0.*8 bits"):
+        frames.cached_frames(dataset, KEY, (SIDE, SIDE), tmp_path / "cache")
+
+
+def converted(recorded, tmp_path, mode, channels):
+    """The dataset with stored pictures in another of Pillow's modes."""
+    root = shutil.copytree(recorded, tmp_path / "converted")
     info = json.loads((root / "meta/info.json").read_text())
-    info["features"][KEY]["shape"] = [SIDE, SIDE, 1]
+    info["features"][KEY]["shape"] = [SIDE, SIDE, channels]
     (root / "meta/info.json").write_text(json.dumps(info))
     for path in (root / "data").rglob("*.parquet"):
         table = pq.read_table(path)
         if KEY in table.column_names:
-            pictures = [grey_png(cell["bytes"]) for cell in table[KEY].to_pylist()]
+            pictures = [png(cell["bytes"], mode) for cell in table[KEY].to_pylist()]
             column = pa.array(pictures, type=table.schema.field(KEY).type)
             pq.write_table(table.set_column(table.column_names.index(KEY), table.schema.field(KEY), column), path)
-    dataset = opened(root)
-    assert np.array_equal(frames.cached_frames(dataset, KEY, (SIDE, SIDE), tmp_path / "cache"), read(dataset).numpy())
+    return root
 
 
-def grey_png(data):
-    file = io.BytesIO()
-    Image.open(io.BytesIO(data)).convert("L").save(file, "PNG")
+def png(data, mode):
+    picture, file = Image.open(io.BytesIO(data)), io.BytesIO()
+    deep = {"I;16": np.uint16, "I": np.int32}.get(mode)
+    picture = Image.fromarray(9 * np.asarray(picture.convert("L")).astype(deep)) if deep else picture.convert(mode)
+    picture.save(file, "PNG")
     return {"bytes": file.getvalue(), "path": None}
 
 

@@ -161,26 +161,37 @@ def _reserve(path: Path, size: int) -> None:
 
 def _decode(dataset: LeRobotDataset, key: str, episode: int, rows: range, size: tuple[int, int]) -> Tensor:
     """The frames of these rows, all of one episode, as LeRobot reads them: (rows, C, H, W) uint8, at `size`."""
+    stored, place = key in dataset.meta.image_keys, f"{key} of episode {episode} in {dataset.root}"
     try:
-        if key in dataset.meta.image_keys:
-            read = torch.stack(list(dataset.hf_dataset[rows.start : rows.stop][key]))  # float32 in [0, 1]
-            return resized((read * 255).round().to(torch.uint8), size)
-        times = dataset.hf_dataset.data.column("timestamp")[rows.start : rows.stop].to_numpy()
-        begin = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
-        path = dataset.root / dataset.meta.get_video_file_path(episode, key)
-        wanted = [begin + float(time) for time in times]
-        if dataset._video_backend == "torchcodec":
-            if not hasattr(_own, "decoders"):
-                _own.decoders = VideoDecoderCache(max_size=1)
-            frames = decode_video_frames_torchcodec(
-                path, wanted, dataset.tolerance_s, decoder_cache=_own.decoders, return_uint8=True
-            )
+        if stored:
+            frames = torch.stack(list(dataset.hf_dataset[rows.start : rows.stop][key]))  # float32 in [0, 1]
         else:
-            frames = decode_video_frames_pyav(path, wanted, dataset.tolerance_s, return_uint8=True)
-        return resized(frames, size)
+            frames = _decode_video(dataset, key, episode, rows)
     except Exception as error:  # torchcodec, PyAV and Pillow each raise their own
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise ValueError(
-            f"{key} of episode {episode} in {dataset.root} does not decode ({reason[0][:200]}): fetch its file anew, "
-            "or leave the episode out with --dataset.episodes."
+            f"{place} does not decode ({reason[0][:200]}): fetch its file anew, or leave the episode out with "
+            "--dataset.episodes."
         ) from error
+    channels = colour_cameras(dataset.meta.features)[key]
+    if frames.shape[1] not in (1, channels) or (stored and not (frames.is_floating_point() and frames.max() <= 1)):
+        raise ValueError(
+            f"{place} has pictures of {frames.shape[1]} channels, {frames.dtype}, up to {frames.max():g}, and read are "
+            f"{channels} channels of 8 bits: leave the camera out, with --policy.cameras or `unimask prepare --drop`. "
+            'Depth is not read where the column\'s "info" in meta/info.json has "is_depth_map": true.'
+        )
+    return resized((frames * 255).round().to(torch.uint8) if stored else frames, size)
+
+
+def _decode_video(dataset: LeRobotDataset, key: str, episode: int, rows: range) -> Tensor:
+    times = dataset.hf_dataset.data.column("timestamp")[rows.start : rows.stop].to_numpy()
+    begin = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
+    path = dataset.root / dataset.meta.get_video_file_path(episode, key)
+    wanted = [begin + float(time) for time in times]
+    if dataset._video_backend != "torchcodec":
+        return decode_video_frames_pyav(path, wanted, dataset.tolerance_s, return_uint8=True)
+    if not hasattr(_own, "decoders"):
+        _own.decoders = VideoDecoderCache(max_size=1)
+    return decode_video_frames_torchcodec(
+        path, wanted, dataset.tolerance_s, decoder_cache=_own.decoders, return_uint8=True
+    )
