@@ -126,7 +126,8 @@ class UniMASKConfig(PreTrainedConfig):
     sample_actions: bool = False
     """Whether acting draws from the answer instead of taking its most likely action."""
     n_obs_steps: int | None = None
-    """Steps that acting remembers, at most K; None: K. A setting of acting, not of training."""
+    """Steps that acting remembers, at most K; None: K. A setting of acting, not of training; but where K is long, fewer
+    want a training with drop_n_last_frames=0."""
     chunk_size: int = 1
     """H: actions that acting asks for at once, from the present on. H - 1 steps of the window then lie ahead of the
     present, for as long as the episode lasts."""

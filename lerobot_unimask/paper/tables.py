@@ -331,21 +331,20 @@ def _trained_as_long(ours: Record, others: Record) -> str:
     return markdown_table(heads, dict.fromkeys(rows))
 
 
-def _remembered_success(record: Record) -> str:
-    """Success in % by the steps that acting remembers, h, a row for each window."""
-    steps = sorted({int(h) for run in record["runs"] for h in [*run.get("remembers", {}), run["context_length"]]})
-    rows = []
+def _remembered(record: Record) -> str:
+    """Success in %, or mean return, by the steps that acting remembers, h, a row for each window."""
+    rows = {}
     for run in record["runs"]:
-        found = run.get("remembers", {}) | {str(run["context_length"]): run}
-        name = f"{run['task']}, K = {run['context_length']}"
-        rows.append((name, *(_percent([found[str(h)]]) if str(h) in found else None for h in steps)))
-    return markdown_table(("", *(f"h = {h}" for h in steps)), rows)
+        found = {str(run["context_length"]): run} | run["remembers"]
+        cells = {int(h): _return(one) if "mean_return" in one else _percent([one]) for h, one in found.items()}
+        rows[f"{run['task']}, K = {run['context_length']}, {run['updates']:,} updates"] = cells
+    steps = sorted({h for cells in rows.values() for h in cells})
+    body = ((name, *map(cells.get, steps)) for name, cells in rows.items())
+    return markdown_table(("", *(f"h = {h}" for h in steps)), body)
 
 
-def _remembered_returns(record: Record) -> str:
-    found = record["remembers"]
-    row = (f"{one['mean_return']:.2f} ({one['standard_error']:.2f})" for one in found.values())
-    return markdown_table([f"h = {h}" for h in found], [list(row)])
+def _return(run: Record) -> str:
+    return f"{run['mean_return']:.2f} ({run['standard_error']:.2f})"
 
 
 # --- Which table a head is of ----------------------------------------------------------------------------------------
@@ -370,8 +369,7 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"one model a task": _beside_a_perceptron,
     r"models \|.*\| mean": _one_for_all,
     r"task \| policy \| trained for": _trained_as_long,
-    r"\s*\| h = 1": _remembered_success,
-    r"h = 1": _remembered_returns,
+    r"\s*\| h = 1": _remembered,
     r"H \| carried out": study_tables.acting_table,
     r"delay \| mask": study_tables.real_time_table,
     r"in the maze": study_tables.tasks_table,
