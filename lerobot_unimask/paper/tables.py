@@ -107,6 +107,14 @@ def _beside_the_optimum(record: Record) -> str:
     return markdown_table(("task", "this policy", "best possible", "difference"), rows)
 
 
+def _above_the_optimum(*records: Record) -> str:
+    def above(record: Record, task: str) -> str:
+        return f"{record['mean'][task] - record['optimum']['losses'][task]:.3f}"
+
+    rows = ((f"`{task}`", *(above(record, task) for record in records)) for task in TASKS)
+    return markdown_table(("nats above the optimum", "24 November", "second seed", "28 November"), rows)
+
+
 def _causal_share(both: Record, both_1: Record, random: Record, random_1: Record, stacked: Record) -> str:
     def row(task: str) -> tuple[str, ...]:
         causal, alone = ([found["mean"][task] for found in pair] for pair in ((both, both_1), (random, random_1)))
@@ -354,6 +362,7 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"action rule": _action_rules,
     r"the goal in the picture": _from_pictures,
     r"task \| this policy \| best": _beside_the_optimum,
+    r"nats above the optimum": _above_the_optimum,
     r"task \| 7.5 % causal": _causal_share,
     r"sampled rollouts": _asked_rollouts,
     r"return asked for": _asked_returns,
