@@ -339,6 +339,21 @@ def _trained_as_long(ours: Record, others: Record) -> str:
     return markdown_table(heads, dict.fromkeys(rows))
 
 
+def _trained_on_pictures(record: Record) -> str:
+    """Policies after equal processor time, a row for each."""
+    rows = (
+        (
+            run["policy"],
+            f"{run['train_processor_seconds']:.0f} s",
+            f"{run['updates']:,}",
+            f"{run['parameters'] / 1e6:.2f} M",
+            _percent([run]),
+        )
+        for run in record["runs"]
+    )
+    return markdown_table(("policy", "trained for", "updates", "parameters", "success"), rows)
+
+
 def _remembered(record: Record) -> str:
     """Success in %, or mean return, by the steps that acting remembers, h, a row for each window."""
     rows = {}
@@ -378,6 +393,7 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"one model a task": _beside_a_perceptron,
     r"models \|.*\| mean": _one_for_all,
     r"task \| policy \| trained for": _trained_as_long,
+    r"policy \| trained for": _trained_on_pictures,
     r"\s*\| h = 1": _remembered,
     r"H \| carried out": study_tables.acting_table,
     r"delay \| mask": study_tables.real_time_table,
