@@ -21,6 +21,7 @@ ROWS = [  # of the Maze2D table, in the paper's order
     "unimask_random_mask",
     "unimask_random_mask_finetune",
     "acts_and_asks",
+    "acts_and_asks_gaussian",
     "feedforward",
     "decision_transformer",
     "decision_gpt",
