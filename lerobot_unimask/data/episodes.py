@@ -16,8 +16,6 @@ from typing import Any, NoReturn
 import datasets
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from datasets.features.features import string_to_arrow
 from lerobot.datasets import dataset_metadata
 from lerobot.datasets.factory import resolve_delta_timestamps
@@ -31,7 +29,7 @@ from torch.utils.data import default_collate
 
 from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.reads import read_cameras
-from lerobot_unimask.data.soundness import are_statistics, data_files, episode_files
+from lerobot_unimask.data.soundness import are_statistics, data_files, episode_files, naming, outline, read_table
 from lerobot_unimask.records import read_json
 
 logger = logging.getLogger(__name__)
@@ -93,9 +91,9 @@ def check_tables(root: Path, info: Mapping[str, Any], without: Sequence[str] = (
             metadata count, though no file is missing.
     """
     columns = {key for key, entry in info["features"].items() if entry["dtype"] != "video" and key not in without}
-    rows, episodes = 0, sum(_table(path)[0] for path in episode_files(root))
+    rows, episodes = 0, sum(outline(path)[0] for path in episode_files(root))
     for path in data_files(root):
-        count, names = _table(path)
+        count, names = outline(path)
         rows += count
         lacking = sorted(columns - set(names))
         if lacking:
@@ -121,38 +119,13 @@ def check_tables(root: Path, info: Mapping[str, Any], without: Sequence[str] = (
         )
 
 
-def _table(path: Path) -> tuple[int, list[str]]:
-    """How many rows a file's table has, and its columns."""
-    with _naming(path):
-        table = pq.read_metadata(path)
-        return table.num_rows, table.schema.to_arrow_schema().names
-
-
-def _read(path: Path, columns: list[str]) -> pa.Table:
-    with _naming(path):
-        return pq.read_table(path, columns=columns)
-
-
-@contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """
-    Raises:
-        ValueError: the file is no whole table.
-    """
-    try:
-        yield
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"{path} cannot be read as a table ({reason}): copy it, or fetch it, anew.") from error
-
-
 def _places(root: Path) -> np.ndarray:
     """Each episode's first row, the one after its last, and how many it has, (3, E)."""
     names = ["dataset_from_index", "dataset_to_index", "length"]
     rows = [np.zeros((0, 3), np.int64)]
     for path in episode_files(root):
-        there = [name for name in names if name in _table(path)[1]]
-        table = _read(path, there).to_pandas()
+        there = [name for name in names if name in outline(path)[1]]
+        table = read_table(path, there).to_pandas()
         try:
             rows.append(table[names].to_numpy(np.int64))
         except (KeyError, ValueError, TypeError) as error:
@@ -174,8 +147,8 @@ def absent_files(root: Path, info: Mapping[str, Any], episodes: Sequence[int] | 
         rows = {
             tuple(row[name] for name in names)
             for path in files
-            if set(names) <= set(_table(path)[1])
-            for row in _read(path, ["episode_index", *names]).to_pylist()
+            if set(names) <= set(outline(path)[1])
+            for row in read_table(path, ["episode_index", *names]).to_pylist()
             if episodes is None or row["episode_index"] in episodes
         }
         form = info.get(pattern) or {"data_path": DEFAULT_DATA_PATH, "video_path": DEFAULT_VIDEO_PATH}[pattern]
@@ -200,7 +173,7 @@ def check_whole(root: Path, episodes: Sequence[int] | None = None, without: Sequ
             f"{root} lacks {paths[0]}{more}, which belong to it: copy or fetch them anew"
             f"{'' if absent.get('') else or_else}."
         )
-    columns = [_read(path, ["episode_index"]).column(0).unique() for path in data_files(root)]
+    columns = [read_table(path, ["episode_index"]).column(0).unique() for path in data_files(root)]
     there = {episode for column in columns for episode in column.to_pylist()}
     lacking = sorted(set(range(info["total_episodes"]) if episodes is None else episodes) - there)
     if lacking:
@@ -225,9 +198,9 @@ def check_age(root: Path, version: str) -> None:
 def order_of_tasks(root: Path) -> dict[int, str] | None:
     """task_index -> text, by rising numbers, as a dataset's table of tasks has them; None where the table is as LeRobot
     reads it: its index are the texts, and the n-th row has number n."""
-    if "task_index" not in _table(root / TASKS)[1]:
+    if "task_index" not in outline(root / TASKS)[1]:
         raise ValueError(f"{root / TASKS} has no task_index, by which the rows name their task: fetch it anew.")
-    with _naming(root / TASKS):
+    with naming(root / TASKS):
         table = pd.read_parquet(root / TASKS)
     texts = table.get("task", table.index)
     numbers = table["task_index"].tolist()
