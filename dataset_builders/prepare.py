@@ -262,7 +262,7 @@ def _rewrite_all(source: Path, partial: Path, plan: Plan) -> None:
         if numbers:
             renumbered = np.searchsorted(list(numbers), arrays["task_index"].to_numpy())
             arrays["task_index"] = pa.chunked_array([renumbered])
-        cells = [_as_stored(arrays[f.name], f.type, features[f.name]["shape"]) for f in fields]
+        cells = [_as_stored(f.name, arrays[f.name], f.type, features[f.name]["shape"]) for f in fields]
         return pa.table(cells, schema=pa.schema(fields, metadata=stored.metadata))
 
     for path in data_files(source):
@@ -319,13 +319,25 @@ def _entry(old: str, entry: dict[str, Any], plan: Plan, columns: Mapping[str, np
     return entry
 
 
-def _as_stored(column: pa.ChunkedArray, kind: pa.DataType, shape: Sequence[int]) -> pa.Array | pa.ChunkedArray:
-    """A column as its new type stores it: a list of a row's numbers, or the number itself."""
+def _as_stored(
+    key: str, column: pa.ChunkedArray, kind: pa.DataType, shape: Sequence[int]
+) -> pa.Array | pa.ChunkedArray:
+    """A column as its new type stores it: a list of a row's numbers, or the number itself.
+
+    Raises:
+        ValueError: it holds other things.
+    """
     if column.type == kind:
         return column
-    if pa.types.is_struct(column.type):  # pictures
-        return column.cast(kind)
-    return as_cells(flat_numbers(column).reshape(len(column), int(np.prod(shape))), kind)
+    try:
+        if pa.types.is_struct(column.type):  # pictures
+            return column.cast(kind)
+        return as_cells(flat_numbers(column).reshape(len(column), int(np.prod(shape))), kind)
+    except (ValueError, TypeError, pa.ArrowException) as error:
+        raise ValueError(
+            f"{key} holds {column.type}, and meta/info.json says {kind} of shape {tuple(shape)} ({error}): mend the "
+            f"data, or leave the column out with --drop {key}."
+        ) from error
 
 
 def _episodes_table(table: pa.Table, plan: Plan, found: Mapping[str, EpisodeStatistics]) -> pa.Table:

@@ -238,9 +238,11 @@ class UniMASKConfig(PreTrainedConfig):
             self.use_amp = False
         for name, most in MOST.items():
             value, bound = getattr(self, name), getattr(self, most) if isinstance(most, str) else most
-            if value is not None and not 1 <= value <= bound:
+            if value is None and name == "n_obs_steps":
+                continue
+            if value is None or not 1 <= value <= bound:
                 limit = f", {most}" if bound != most else ""
-                if most == "context_length" and value > bound:
+                if most == "context_length" and (value or 0) > bound:
                     limit += f". For more train with --policy.context_length={value} or more"
                 raise ValueError(f"{name} is {value}; it must lie in 1 to {bound}{limit}.")
         if self.drop_n_last_frames is None:

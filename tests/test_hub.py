@@ -86,6 +86,8 @@ WRONG = {
     "a wrong type": ({"width": "wide"}, "`width`: Couldn't parse 'wide' into an int"),
     "a list for a number": ({"context_length": [10]}, "context_length"),
     "width of 1000000000": ({"width": 10**9}, "width is 1000000000; it must lie in 1 to"),
+    "no depth": ({"depth": None}, "depth is None; it must lie in 1 to"),
+    "no feedforward_width": ({"feedforward_width": None}, "feedforward_width is None; it must lie in 1 to"),
     "a factor's size": (
         {"features": {"s": [{"key": "observation.state", "size": 10**9}], "a": [{"key": "action", "size": 1}]}},
         "observation.state has size 1000000000",

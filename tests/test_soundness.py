@@ -19,7 +19,7 @@ from lerobot.policies.factory import make_policy
 from dataset_builders.maze2d import build_maze2d
 from lerobot_unimask import UniMASKConfig
 from lerobot_unimask.data import episodes, soundness
-from lerobot_unimask.data.episodes import open_dataset
+from lerobot_unimask.data.episodes import open_dataset, read_info, read_windows
 
 SMALL = {"width": 16, "depth": 1, "heads": 2, "feedforward_width": 16, "device": "cpu", "push_to_hub": False}
 
@@ -184,20 +184,44 @@ def spoil_info(root, **entries):
     path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
 
 
-def drop_rows(root, change):
-    (path,) = (root / "data").glob("*/*.parquet")
-    pq.write_table(change(pq.read_table(path)), path)
+def with_column(key, values):
+    """Change a table so that a column holds these values, each row the next one, again and again."""
+    return lambda table: table.set_column(
+        table.column_names.index(key), key, pa.array([values[i % len(values)] for i in range(len(table))])
+    )
 
 
-DATA = "data/chunk-000/file-000.parquet"
+DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+TASKS = "meta/tasks.parquet"
+
+
+def spoil_bytes(path):
+    content = path.read_bytes()
+    path.write_bytes(content[:4] + b"\xff" * 40 + content[44:])
+
+
+def table_changed(file, change):
+    """A damage: a function of a dataset's folder."""
+    return lambda root: pq.write_table(change(pq.read_table(root / file).replace_schema_metadata(None)), root / file)
+
+
 DAMAGES = {
     "no table": (lambda root: (root / DATA).unlink(), DATA),
     "no episodes": (lambda root: shutil.rmtree(root / "meta" / "episodes"), "meta/episodes"),
     "no tasks": (lambda root: (root / "meta" / "tasks.parquet").unlink(), "meta/tasks.parquet"),
     "a table cut short": (lambda root: (root / DATA).write_bytes((root / DATA).read_bytes()[:-9]), DATA),
     "tasks that are a pointer": (lambda root: (root / "meta" / "tasks.parquet").write_text("version https"), "tasks"),
-    "rows cut off": (lambda root: drop_rows(root, lambda table: table.slice(0, 590)), "590"),
-    "a column cut off": (lambda root: drop_rows(root, lambda table: table.drop_columns("action")), "action"),
+    "rows cut off": (table_changed(DATA, lambda table: table.slice(0, 590)), "590"),
+    "a column cut off": (table_changed(DATA, lambda table: table.drop_columns("action")), "action"),
+    "texts for numbers": (table_changed(DATA, with_column("index", ["x"])), "x"),
+    "rows of no episode": (table_changed(DATA, with_column("episode_index", [None, 0])), "episode_index"),
+    "an episode elsewhere": (table_changed(EPISODES, with_column("dataset_from_index", [-7])), "-7"),
+    "an episode too long": (table_changed(EPISODES, with_column("length", [200, 99, 200])), "99"),
+    "lengths that are none": (table_changed(EPISODES, with_column("length", ["x"])), "length"),
+    "no lengths": (table_changed(EPISODES, lambda table: table.drop_columns("length")), "length"),
+    "tasks without numbers": (table_changed(TASKS, lambda t: t.drop_columns("task_index")), TASKS),
+    "tasks with lists for numbers": (table_changed(TASKS, with_column("task_index", [[1.0]])), TASKS),
+    "bytes within a table": (lambda root: spoil_bytes(root / EPISODES), EPISODES),
     "an episode too many": (lambda root: spoil_info(root, total_episodes=4), "4 episodes"),
     "a frame too many": (lambda root: spoil_info(root, total_frames=601), "601 frames"),
     "paths of the old format": (lambda root: spoil_info(root, data_path="{episode_index}.parquet"), "data_path"),
@@ -215,6 +239,14 @@ def test_what_is_missing_or_damaged_is_named(root, damage, named, monkeypatch):
     with pytest.raises((FileNotFoundError, ValueError), match=str(root)) as raised:
         open_dataset(UniMASKConfig(**SMALL), None if named else root, root.name)
     assert word in str(raised.value)
+
+
+def test_rows_that_hold_nothing_do_not_hinder_where_nobody_reads_them(root):
+    wind = {"dtype": "float32", "shape": [1], "names": None}
+    spoil_info(root, features={**read_info(root)["features"], "wind": wind})
+    table_changed(DATA, lambda table: table.append_column("wind", pa.array([None, 1.0] * 300, pa.float32())))(root)
+    dataset = open_dataset(UniMASKConfig(**SMALL), root)
+    assert "wind" not in read_windows(dataset, [0, 3])
 
 
 def test_files_that_are_not_read_may_be_missing(root):

@@ -14,9 +14,8 @@ from string import Formatter
 from typing import Any, NoReturn
 
 import datasets
+import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from datasets.features.features import string_to_arrow
 from lerobot.datasets import dataset_metadata
 from lerobot.datasets.factory import resolve_delta_timestamps
@@ -30,7 +29,7 @@ from torch.utils.data import default_collate
 
 from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.reads import read_cameras
-from lerobot_unimask.data.soundness import are_statistics, data_files, episode_files, episode_lengths
+from lerobot_unimask.data.soundness import are_statistics, data_files, episode_files, naming, outline, read_table
 from lerobot_unimask.records import read_json
 
 logger = logging.getLogger(__name__)
@@ -92,11 +91,11 @@ def check_tables(root: Path, info: Mapping[str, Any], without: Sequence[str] = (
             metadata count, though no file is missing.
     """
     columns = {key for key, entry in info["features"].items() if entry["dtype"] != "video" and key not in without}
-    rows, episodes = 0, sum(_table(path).num_rows for path in episode_files(root))
+    rows, episodes = 0, sum(outline(path)[0] for path in episode_files(root))
     for path in data_files(root):
-        table = _table(path)
-        rows += table.num_rows
-        lacking = sorted(columns - set(table.schema.to_arrow_schema().names))
+        count, names = outline(path)
+        rows += count
+        lacking = sorted(columns - set(names))
         if lacking:
             raise ValueError(
                 f"{path} lacks {', '.join(lacking)}, which meta/info.json names: fetch the file anew, or `unimask "
@@ -104,8 +103,15 @@ def check_tables(root: Path, info: Mapping[str, Any], without: Sequence[str] = (
             )
     if any(key not in without for key in absent_files(root, info)):
         return
-    frames = int(episode_lengths(root).sum())
-    if rows != frames or frames < info["total_frames"] or episodes < info["total_episodes"]:
+    first, end, lengths = _places(root)
+    wrong = np.flatnonzero((first < 0) | (end - first != lengths))
+    if len(wrong):
+        raise ValueError(
+            f"meta/episodes of {root} gives its episode {wrong[0]} the rows from {first[wrong[0]]} up to "
+            f"{end[wrong[0]]} and {lengths[wrong[0]]} frames: fetch what is damaged anew."
+        )
+    frames, last = int(lengths.sum()), end.max(initial=0)
+    if rows != frames or last > rows or frames < info["total_frames"] or episodes < info["total_episodes"]:
         raise ValueError(
             f"{root} counts {info['total_frames']} frames of {info['total_episodes']} episodes in meta/info.json, "
             f"{frames} of {episodes} in meta/episodes, and has {rows} in data: these have to agree, so fetch anew what "
@@ -113,12 +119,18 @@ def check_tables(root: Path, info: Mapping[str, Any], without: Sequence[str] = (
         )
 
 
-def _table(path: Path) -> pq.FileMetaData:
-    try:
-        return pq.read_metadata(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"{path} cannot be read as a table ({reason}): copy it, or fetch it, anew.") from error
+def _places(root: Path) -> np.ndarray:
+    """Each episode's first row, the one after its last, and how many it has, (3, E)."""
+    names = ["dataset_from_index", "dataset_to_index", "length"]
+    rows = [np.zeros((0, 3), np.int64)]
+    for path in episode_files(root):
+        there = [name for name in names if name in outline(path)[1]]
+        table = read_table(path, there).to_pandas()
+        try:
+            rows.append(table[names].to_numpy(np.int64))
+        except (KeyError, ValueError, TypeError) as error:
+            raise ValueError(f"{path} lacks whole numbers as {', '.join(names)}: fetch it anew.") from error
+    return np.concatenate(rows).T
 
 
 def absent_files(root: Path, info: Mapping[str, Any], episodes: Sequence[int] | None = None) -> dict[str, list[str]]:
@@ -135,8 +147,8 @@ def absent_files(root: Path, info: Mapping[str, Any], episodes: Sequence[int] | 
         rows = {
             tuple(row[name] for name in names)
             for path in files
-            if set(names) <= set(pq.read_schema(path).names)
-            for row in pq.read_table(path, columns=["episode_index", *names]).to_pylist()
+            if set(names) <= set(outline(path)[1])
+            for row in read_table(path, ["episode_index", *names]).to_pylist()
             if episodes is None or row["episode_index"] in episodes
         }
         form = info.get(pattern) or {"data_path": DEFAULT_DATA_PATH, "video_path": DEFAULT_VIDEO_PATH}[pattern]
@@ -149,8 +161,10 @@ def check_whole(root: Path, episodes: Sequence[int] | None = None, without: Sequ
     """
     Raises:
         FileNotFoundError: a file is missing that the metadata name for these episodes, but for columns `without`.
+        ValueError: there is no frame of one of these episodes.
     """
-    absent = absent_files(root, read_info(root), episodes)
+    info = read_info(root)
+    absent = absent_files(root, info, episodes)
     paths = [path for key, found in absent.items() if key not in without for path in found]
     if paths:
         more = f" and {len(paths) - 1} more files" if len(paths) > 1 else ""
@@ -158,6 +172,14 @@ def check_whole(root: Path, episodes: Sequence[int] | None = None, without: Sequ
         raise FileNotFoundError(
             f"{root} lacks {paths[0]}{more}, which belong to it: copy or fetch them anew"
             f"{'' if absent.get('') else or_else}."
+        )
+    columns = [read_table(path, ["episode_index"]).column(0).unique() for path in data_files(root)]
+    there = {episode for column in columns for episode in column.to_pylist()}
+    lacking = sorted(set(range(info["total_episodes"]) if episodes is None else episodes) - there)
+    if lacking:
+        raise ValueError(
+            f"{root} has no frame of episode {lacking[0]}, by their episode_index: fetch its tables anew, or name "
+            "others with --dataset.episodes."
         )
 
 
@@ -176,10 +198,14 @@ def check_age(root: Path, version: str) -> None:
 def order_of_tasks(root: Path) -> dict[int, str] | None:
     """task_index -> text, by rising numbers, as a dataset's table of tasks has them; None where the table is as LeRobot
     reads it: its index are the texts, and the n-th row has number n."""
-    _table(root / TASKS)
-    table = pd.read_parquet(root / TASKS)
+    if "task_index" not in outline(root / TASKS)[1]:
+        raise ValueError(f"{root / TASKS} has no task_index, by which the rows name their task: fetch it anew.")
+    with naming(root / TASKS):
+        table = pd.read_parquet(root / TASKS)
     texts = table.get("task", table.index)
     numbers = table["task_index"].tolist()
+    if not all(isinstance(number, int) for number in numbers):
+        raise ValueError(f"{root / TASKS} numbers its texts {str(numbers)[:80]}: fetch it anew.")
     if "task" not in table and numbers == list(range(len(numbers))) and all(isinstance(text, str) for text in texts):
         return None
     return dict(sorted(zip(numbers, map(str, texts), strict=True)))
@@ -314,9 +340,10 @@ def open_checked(
     except (OSError, datasets.exceptions.DatasetGenerationError) as error:
         if there:
             check_whole(place, episodes)
-        if isinstance(error, OSError):
-            raise
-        raise ValueError(f"The tables of {repo_id} cannot be read ({error.__cause__}): fetch them anew.") from error
+        if type(error) is OSError or not isinstance(error, OSError):  # Arrow's, which name no file
+            reason = str(error.__cause__ or error).splitlines()[0]
+            raise ValueError(f"{place} has tables that cannot be read as meta/info.json says: {reason}") from error
+        raise
     if not there:
         check_format(Path(dataset.root))
     return dataset

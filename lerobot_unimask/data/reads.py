@@ -24,9 +24,10 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.io_utils import hf_transform_to_torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import DEFAULT_FEATURES
 from torch.utils.data._utils.collate import collate
 
-from lerobot_unimask.data.factors import TEXTS
+from lerobot_unimask.data.factors import ACTION, ENVIRONMENT_STATE, RETURN_TO_GO, STATE, TEXTS
 from lerobot_unimask.data.frames import cached_frames
 from lerobot_unimask.data.soundness import innermost
 
@@ -254,30 +255,37 @@ class ReadsCameras(Protocol):
 
     image_size: list[int]
     cache_frames: bool
+    states: list[str] | None
+    properties: list[str]
 
     def cameras_of(self, dataset_features: dict[str, dict[str, Any]]) -> list[str]: ...
 
 
 def read_cameras(dataset: LeRobotDataset, settings: ReadsCameras, whole: LeRobotDataset | None = None) -> None:
     """From here on the dataset has the cameras that a policy reads, and decodes no others; their frames are cached
-    where the settings say so and LeRobot does not augment them. Columns of texts go too, which cannot be read in
-    batches and which no policy of ours reads.
+    where the settings say so and LeRobot does not augment them. Other columns that cannot be read in batches go too,
+    of texts or with rows that hold nothing.
 
     Args:
         whole: dataset with more episodes of the same folder whose frames are cached already.
 
     Raises:
-        ValueError, OSError: what `cached_frames` and `cameras_of` raise.
+        ValueError, OSError: what `cached_frames` and `cameras_of` raise, and a row that does not say where it belongs.
     """
-    features = dataset.meta.features
+    features, hf_dataset = dataset.meta.features, dataset.hf_dataset
     wanted = settings.cameras_of(features)
     unread = [key for key in dataset.meta.camera_keys if key not in wanted]
     unread += [key for key, entry in features.items() if entry["dtype"] in TEXTS]
+    read = {STATE, ENVIRONMENT_STATE, ACTION, RETURN_TO_GO, *(settings.states or ()), *settings.properties}
+    for key in set(hf_dataset.column_names) - {*dataset.meta.camera_keys, *unread, *read}:
+        if any(chunk.null_count or innermost(chunk).null_count for chunk in hf_dataset.data.column(key).chunks):
+            if key in DEFAULT_FEATURES:
+                raise ValueError(f"{key} is empty in rows of {dataset.root}, which nothing else places: fetch it anew.")
+            unread.append(key)
     for key in unread:
         del features[key]
         (dataset.reader.delta_indices or {}).pop(key, None)
     if unread:
-        hf_dataset = dataset.hf_dataset
         stored = [key for key in unread if key in hf_dataset.column_names]
         dataset.reader.hf_dataset = hf_dataset.remove_columns(stored)
     if not wanted or not settings.cache_frames or dataset.image_transforms is not None:

@@ -35,6 +35,31 @@ def episode_lengths(root: Path) -> np.ndarray:
     return np.concatenate([pq.read_table(path, columns=["length"]).column("length") for path in episode_files(root)])
 
 
+def outline(path: Path) -> tuple[int, list[str]]:
+    """How many rows a file's table has, and its columns."""
+    with naming(path):
+        table = pq.read_metadata(path)
+        return table.num_rows, table.schema.to_arrow_schema().names
+
+
+def read_table(path: Path, columns: list[str]) -> pa.Table:
+    with naming(path):
+        return pq.readoutline(path, columns=columns)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """
+    Raises:
+        ValueError: the file is no whole table.
+    """
+    try:
+        yield
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{path} cannot be read as a table ({reason}): copy it, or fetch it, anew.") from error
+
+
 def innermost(array: pa.Array) -> pa.Array:
     """What (nested) lists, or LeRobot's own types, hold, one number after another."""
     while isinstance(array, pa.ExtensionArray) or pa.types.is_nested(array.type):

@@ -19,8 +19,11 @@ from typing import Any
 
 import attack_ground  # noqa: F401 (first: it sets up what others read as they are imported)
 import attack_hindrances as hindrances
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 from attack_ground import (
+    CONFIG,
     HOME,
     HUB,
     Attack,
@@ -32,9 +35,11 @@ from attack_ground import (
     small_policy,
 )
 from huggingface_hub.utils import _http
+from lerobot.policies.factory import make_policy
 from safetensors.torch import load_file, save_file
 
 from dataset_builders.doorkey import build_doorkey
+from dataset_builders.prepare import make_plan, prepare
 from lerobot_unimask import UniMASKPolicy
 from lerobot_unimask.data.episodes import first_windows, open_dataset, read_info
 from lerobot_unimask.language.masks import TASKS, parse, tabulate
@@ -162,6 +167,60 @@ def infos(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
         yield attempt(lambda: cards.dataset_card(folder, "me/data"))
 
 
+def damaged_files(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
+    """A dataset with a file gone, cut or of other bytes, or a table of other rows or columns: opened, taken over by a
+    policy, looked at, and prepared."""
+    draw = random.Random(0)
+    files = sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.suffix in (".json", ".parquet"))
+    tables = [file for file in files if file.endswith(".parquet")]
+
+    def changed_bytes(path: Path) -> None:
+        content, place = path.read_bytes(), draw.randrange(path.stat().st_size)
+        path.write_bytes(content[:place] + draw.randbytes(8) + content[place + 8 :])
+
+    damages: list[Callable[[Path], Any]] = [
+        lambda path: path.unlink(),
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.read_bytes()[: draw.randrange(path.stat().st_size)]),
+        changed_bytes,
+        changed_bytes,
+        lambda path: path.write_text("<!DOCTYPE html><html><body>Log in</body></html>"),
+        lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"),
+        lambda path: (path.unlink(), path.mkdir()),
+        lambda path: (path.unlink(), path.symlink_to("nowhere")),
+    ]
+
+    def of(change: Callable[[pa.Table, int], pa.Table]) -> Callable[[Path], Any]:
+        def rewrite(path: Path) -> None:
+            table = pq.read_table(path).replace_schema_metadata(None)
+            pq.write_table(change(table, draw.randrange(table.num_columns)), path)
+
+        return rewrite
+
+    changes = [
+        of(lambda table, i: table.remove_column(i)),
+        of(lambda table, i: table.set_column(i, table.column_names[i], pa.nulls(len(table), table.column(i).type))),
+        of(lambda table, i: table.set_column(i, table.column_names[i], pa.array(["x"] * len(table)))),
+        of(lambda table, i: table.set_column(i, table.column_names[i], pa.array([-7] * len(table)))),
+        of(lambda table, i: table.set_column(i, table.column_names[i], pa.array([float("nan")] * len(table)))),
+        of(lambda table, i: table.set_column(i, table.column_names[i], pa.array([[1.0]] * len(table)))),
+        of(lambda table, i: table.slice(0, draw.randrange(len(table)))),
+        of(lambda table, i: pa.concat_tables([table, table])),
+        of(lambda table, i: table.take(list(reversed(range(len(table)))))),
+    ]
+
+    def open_it(folder: Path) -> None:
+        dataset = open_dataset(CONFIG(), folder)
+        make_policy(CONFIG(), ds_meta=dataset.meta).forward(first_windows(dataset))
+
+    for i in range(count // 2):
+        folder = shutil.copytree(root, HOME / "damaged" / str(i))
+        file = folder / draw.choice(tables if i % 2 else files)
+        draw.choice(changes if i % 2 else damages)(file)
+        yield attempt(lambda f=folder: open_it(f))
+        yield attempt(lambda f=folder: prepare(f, make_plan(f), output=f.with_name(f"{f.name}_made")))
+
+
 def calls(count: int, root: Path) -> Iterator[tuple[str, Outcome]]:
     """Calls of infer, sample, select_action and forward with values of any kind."""
     policy, draw = small_policy(root), random.Random(0)
@@ -253,6 +312,7 @@ ATTACKS: dict[str, tuple[Attack, int]] = {
     "weights: not finite, of other types and shapes, cut, other bytes": (weights, 300),
     "entries of a policy's config.json": (configs, 2_000),
     "entries of a dataset's info.json": (infos, 2_000),
+    "files of a dataset: gone, cut, of other bytes, rows and columns": (damaged_files, 400),
     "calls in Python with values of any kind": (calls, 20_000),
     "pulls from a Hub at fault": (pulls, 60),
     "pushes to a Hub at fault": (pushes, 40),
