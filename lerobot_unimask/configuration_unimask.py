@@ -238,9 +238,7 @@ class UniMASKConfig(PreTrainedConfig):
             self.use_amp = False
         for name, most in MOST.items():
             value, bound = getattr(self, name), getattr(self, most) if isinstance(most, str) else most
-            if value is None and name == "n_obs_steps":
-                continue
-            if value is None or not 1 <= value <= bound:
+            if not (1 <= value <= bound if value is not None else name == "n_obs_steps"):
                 limit = f", {most}" if bound != most else ""
                 if most == "context_length" and (value or 0) > bound:
                     limit += f". For more train with --policy.context_length={value} or more"
