@@ -44,7 +44,7 @@ def outline(path: Path) -> tuple[int, list[str]]:
 
 def read_table(path: Path, columns: list[str]) -> pa.Table:
     with naming(path):
-        return pq.readoutline(path, columns=columns)
+        return pq.read_table(path, columns=columns)
 
 
 @contextlib.contextmanager
