@@ -234,11 +234,26 @@ def _start_metaworld() -> None:
 
 
 def make_known_to_policy_server() -> None:
-    """LeRobot's policy server refuses policies that are not in a list of its own; only `unimask serve` calls this.
+    """LeRobot's policy server refuses policies that are not in a list of its own, and takes chunks as long as the
+    checkpoint's config says, here 1 by default, however many actions a client asks for. Now they are as long as it
+    asks, or as the window. Only `unimask serve` calls this.
 
     Other policies: unchanged.
     """
     from lerobot.async_inference.constants import SUPPORTED_POLICIES
+    from lerobot.async_inference.policy_server import PolicyServer
 
-    if "unimask" not in SUPPORTED_POLICIES:
-        SUPPORTED_POLICIES.append("unimask")
+    if "unimask" in SUPPORTED_POLICIES:
+        return
+    SUPPORTED_POLICIES.append("unimask")
+    load = PolicyServer.SendPolicyInstructions
+
+    @functools.wraps(load)
+    def load_for_chunks(self: Any, request: Any, context: Any) -> Any:
+        answer = load(self, request, context)
+        if self.policy is not None and self.policy_type == "unimask":
+            config = self.policy.config
+            config.chunk_size = min(self.actions_per_chunk, config.context_length)
+        return answer
+
+    PolicyServer.SendPolicyInstructions = load_for_chunks

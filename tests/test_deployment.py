@@ -106,6 +106,9 @@ def test_lerobots_client_drives_the_robot_from_the_policy_server(checkpoint, tmp
 
     from lerobot_unimask import cli
 
+    policy = UniMASKPolicy.from_pretrained(checkpoint)
+    policy.config.chunk_size = 1  # as long as the client asks for all the same
+    policy.save_pretrained(tmp_path / "short")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -115,7 +118,9 @@ def test_lerobots_client_drives_the_robot_from_the_policy_server(checkpoint, tmp
     server = threading.Thread(target=cli.main, args=(["serve", "--host=127.0.0.1", f"--port={port}", "--fps=100"],))
     server.start()
     robot = maze_robot.MazeRobotConfig(log=tmp_path / "log.json")
-    config = RobotClientConfig("unimask", str(checkpoint), robot, H, server_address=f"127.0.0.1:{port}", fps=100)
+    config = RobotClientConfig(
+        "unimask", str(tmp_path / "short"), robot, H, server_address=f"127.0.0.1:{port}", fps=100
+    )
     client = RobotClient(config)
     try:
         grpc.channel_ready_future(client.channel).result(timeout=60)
@@ -139,7 +144,7 @@ def test_lerobots_client_drives_the_robot_from_the_policy_server(checkpoint, tmp
         server.join(10)
     states, actions = read(tmp_path / "log.json")
     assert len(actions) >= 2 * H
-    policy = UniMASKPolicy.from_pretrained(checkpoint)
+    policy.config.chunk_size = H
     first = policy.predict_action_chunk({"observation.state": states[:1]})[0]
     torch.testing.assert_close(actions[0], first[0], rtol=1e-5, atol=1e-5)
 
