@@ -237,7 +237,7 @@ def test_acting_needs_a_question_about_the_action_now(tiny_policy, mask):
 
 
 @pytest.mark.parametrize(
-    "observation", [{}, {"observation.state": torch.zeros(3, 4)}, {"observation.state": torch.zeros(2)}]
+    "observation", [{}, {"observation.state": torch.zeros(3, 4)}, {"observation.state": torch.zeros(3)}]
 )
 def test_other_observations_are_refused(tiny_policy, observation):
     with pytest.raises(ValueError, match=r"observation\.state.* 2 "):
