@@ -83,7 +83,7 @@ STATES = {
     },
     "a tensor without values": torch.zeros(1, 2, device="meta"),
     "no dimensions": torch.tensor(3.0),
-    "one state without its environment": torch.zeros(2),
+    "one state of another size": torch.zeros(3),
     "a window": torch.zeros(1, 10, 2),
     "another number of numbers": torch.zeros(1, 3),
     "NaN": torch.full((1, 2), torch.nan),
