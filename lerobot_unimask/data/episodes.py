@@ -139,7 +139,7 @@ def absent_files(root: Path, info: Mapping[str, Any], episodes: Sequence[int] | 
     Args:
         episodes: those whose files count; None: all.
     """
-    files = episode_files(root)
+    files, counting = episode_files(root), None if episodes is None else set(episodes)
     absent = {"": [TASKS] * (not (root / TASKS).exists()) + ["meta/episodes"] * (not files)}
     for key in ["", *(key for key, entry in info["features"].items() if entry["dtype"] == "video")] if files else ():
         place, pattern = (f"videos/{key}", "video_path") if key else ("data", "data_path")
@@ -149,7 +149,7 @@ def absent_files(root: Path, info: Mapping[str, Any], episodes: Sequence[int] | 
             for path in files
             if set(names) <= set(outline(path)[1])
             for row in read_table(path, ["episode_index", *names]).to_pylist()
-            if episodes is None or row["episode_index"] in episodes
+            if counting is None or row["episode_index"] in counting
         }
         form = info.get(pattern) or {"data_path": DEFAULT_DATA_PATH, "video_path": DEFAULT_VIDEO_PATH}[pattern]
         paths = [form.format(video_key=key, chunk_index=chunk, file_index=file) for chunk, file in sorted(rows)]
