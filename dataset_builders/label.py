@@ -245,7 +245,7 @@ def copy_rest(root: Path, partial: Path, without: Sequence[str] = ()) -> None:
     """Everything that is not rewritten; large files that never change as links where the disk allows it.
 
     Args:
-        without: cameras whose files stay behind.
+        without: cameras whose files stay behind, as links that lead nowhere do.
     """
     rewritten = {*data_files(root), *episode_files(root)}
 
@@ -254,14 +254,15 @@ def copy_rest(root: Path, partial: Path, without: Sequence[str] = ()) -> None:
             return
         if Path(source).relative_to(root).parts[0] in ("videos", "images"):
             try:
-                os.link(source, target)
+                os.link(os.path.realpath(source), target)  # a link may lead elsewhere from there
                 return
             except OSError:
                 pass
         shutil.copy2(source, target)
 
     def left_out(folder: str, names: list[str]) -> list[str]:
-        return [name for name in names if Path(folder).relative_to(root).parts == ("videos",) and name in without]
+        in_videos = Path(folder).relative_to(root).parts == ("videos",)
+        return [name for name in names if (in_videos and name in without) or not Path(folder, name).exists()]
 
     shutil.copytree(root, partial, copy_function=copy, ignore=left_out)
 

@@ -61,7 +61,6 @@ class Plan:
         rename: old name -> new name.
         drop: columns to leave out.
         flatten: columns of several dimensions, or of none, that become rows.
-        plain: columns whose names are nested.
         retype: columns whose type in info.json is none that a table has.
         categories: column -> number of categories, or `auto` to count them.
         statistics: columns, by their new names, whose statistics are absent.
@@ -72,11 +71,15 @@ class Plan:
     rename: dict[str, str] = field(default_factory=dict)
     drop: list[str] = field(default_factory=list)
     flatten: list[str] = field(default_factory=list)
-    plain: list[str] = field(default_factory=list)
     retype: list[str] = field(default_factory=list)
     categories: dict[str, int | str] = field(default_factory=dict)
     statistics: list[str] = field(default_factory=list)
     why: list[str] = field(default_factory=list)
+
+    @property
+    def steps(self) -> list[str]:
+        """The lines of what is done."""
+        return [line for line in self.why if not line.startswith("(not done)")]
 
 
 def make_plan(
@@ -117,6 +120,7 @@ def make_plan(
         if not have and wanted not in asked.values() and found:
             asked[found[0]] = wanted
     plan.drop = [name for name in drop if name != "missing"]
+    plan.why += [f"--drop {name}." for name in plan.drop]
     absent = [] if plan.convert else [key for key in absent_files(root, info) if key]
     for key, entry in features.items():
         seen = key.startswith(OBS_PREFIX) or key in (*asked, *plan.drop, *absent)
@@ -151,10 +155,6 @@ def make_plan(
         if len(entry["shape"]) != 1:
             plan.flatten.append(old)
             plan.why.append(f"flatten {new}: it has shape {tuple(entry['shape'])}, and policies read rows of numbers.")
-        names = entry.get("names")
-        if names and names != flat_names(names):
-            plan.plain.append(old)
-            plan.why.append(f"names of {new}: they are nested.")
         whole = entry["dtype"].startswith(("int", "uint")) and "categories" not in entry
         if new == ACTION and whole and new not in (categories or {}) and old not in (categories or {}):
             plan.why.append(f"(not done) {new} holds whole numbers: if they are choices, --categories {new}=auto.")
@@ -177,7 +177,15 @@ def make_plan(
     for key, count in (categories or {}).items():
         plan.categories[plan.rename.get(key, key)] = count if count == AUTO else int(count)
         plan.why.append(f"--categories {key}={count}.")
+    nested = [plan.rename.get(key, key) for key in features if key not in plan.drop and _is_nested(features[key])]
+    if nested and plan.steps:
+        plan.why.append(f"names of {', '.join(nested)}: they are nested, which alone would not matter.")
     return plan
+
+
+def _is_nested(entry: Mapping[str, Any]) -> bool:
+    """Whether a column's names are nested: read as they are, but plain in a dataset that is written anew."""
+    return entry.get("names") not in (None, flat_names(entry.get("names")))
 
 
 def _fault(known: Mapping[str, Any], size: int, is_read: bool) -> str | None:
@@ -307,9 +315,9 @@ def _entry(old: str, entry: dict[str, Any], plan: Plan, columns: Mapping[str, np
     entry, new = dict(entry), plan.rename.get(old, old)
     if old in plan.flatten:
         entry["shape"] = [int(np.prod(entry["shape"]))]
-    if old in plan.plain or old in plan.flatten:
+    if entry["dtype"] not in PICTURES:
         names = flat_names(entry.get("names"))
-        entry["names"] = names if len(names) == entry["shape"][0] else None
+        entry["names"] = names if len(names) == np.prod(entry["shape"]) else None
     if new in plan.categories:
         values = columns[new]
         count = int(values.max()) + 1 if plan.categories[new] == AUTO else plan.categories[new]

@@ -44,8 +44,6 @@ def main(argv: list[str] | None = None) -> None:
     arguments = make_parser().parse_args(argv)
     arguments.text = shlex.join(["unimask", *argv])  # for records
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    # LeRobot logs a page where FFmpeg is missing, which only datasets with videos need.
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     try:
         check_dataset(arguments)
         if not getattr(arguments, "light", False):

@@ -373,7 +373,7 @@ class UniMASKConfig(PreTrainedConfig):
             if key not in colour or wanted.count(key) > 1:
                 raise ValueError(
                     f"The camera {key!r} is not among the dataset's, or named twice; its colour cameras are "
-                    f"{', '.join(colour) or 'none'}."
+                    f"{', '.join(colour) or 'none'}. `unimask prepare --rename OLD={key}` gives one that name."
                 )
             if not key.startswith(OBS_PREFIX):
                 raise ValueError(

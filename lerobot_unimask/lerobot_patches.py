@@ -9,10 +9,12 @@ import functools
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Iterator
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -21,14 +23,16 @@ from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.errors import LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import dataset_metadata, factory, lerobot_dataset
+from lerobot.datasets import dataset_metadata, factory, lerobot_dataset, video_utils
+from lerobot.datasets.io_utils import cast_stats_to_numpy
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import configs
 from lerobot.scripts import lerobot_eval
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_unimask.data import reads
-from lerobot_unimask.data.episodes import open_checked, sound_statistics
+from lerobot_unimask.data.episodes import open_checked, read_statistics
+from lerobot_unimask.data.soundness import are_statistics
 from lerobot_unimask.data.taking_over import keep_to
 from lerobot_unimask.envs.metaworld.environment import load_metaworld
 from lerobot_unimask.sharing import hub
@@ -44,9 +48,11 @@ def apply() -> None:
         return
     _read_windows_in_batches()
     _read_as_this_policy_needs()
+    _leave_out_unsound_statistics()
     _work_offline()
     _record_integers()
     _say_in_a_line_what_decodes()
+    _end_in_a_sentence()
     _say_why_a_config_is_refused()
     _start_metaworld()
 
@@ -72,12 +78,13 @@ class _ApplyWhereUnpickled:
 
 def _read_as_this_policy_needs() -> None:
     """Streams are refused: LeRobot 0.6.1's fail on windows of a feature of shape (1,), give nothing at all, and wait
-    for ever, with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`. And a dataset that
-    is read in batches gets no DataLoader workers, of which LeRobot starts four: each imports LeRobot first, some 20 s,
-    for batches that take a millisecond, and from the second epoch on they see another order of the data. Of cameras,
-    those that the policy reads are decoded once, others not at all; LeRobot decodes all of a window's frames of all of
-    them at each read. Columns of texts, which cannot be read in batches, are left out. And a policy is to know which
-    episodes are read, where LeRobot tells it of all of them.
+    for ever, with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`. So is a
+    rename_map: LeRobot tells a policy nothing of it, and what is kept of a dataset is read from its files. And a
+    dataset that is read in batches gets no DataLoader workers, of which LeRobot starts four: each imports LeRobot
+    first, some 20 s, for batches that take a millisecond, and from the second epoch on they see another order of the
+    data. Of cameras, those that the policy reads are decoded once, others not at all; LeRobot decodes all of a window's
+    frames of all of them at each read. Columns of texts, which cannot be read in batches, are left out. And a policy is
+    to know which episodes are read, where LeRobot tells it of all of them.
 
     Other policies: unchanged.
     """
@@ -94,6 +101,12 @@ def _read_as_this_policy_needs() -> None:
                 "out --dataset.streaming: columns are memory-mapped, and ten million frames need no more than 2 GB. "
                 "A dataset in a bucket has to be downloaded first, and named with --dataset.root."
             )
+        if cfg.rename_map:
+            names = " ".join(f"--rename {old}={new}" for old, new in cfg.rename_map.items())
+            raise ValueError(
+                "unimask trains on columns by the names that they have in the dataset's files, without --rename_map: "
+                f"`unimask prepare --dataset.root=DIR {names} --output=NEW` gives them others."
+            )
         root = cfg.dataset.root and Path(cfg.dataset.root)
         with _without_imagenet_statistics(cfg):
             dataset = open_checked(
@@ -109,8 +122,7 @@ def _read_as_this_policy_needs() -> None:
 
     @functools.wraps(lerobots_make_both)
     def make_train_eval_datasets(cfg: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-        statistics = sound_statistics() if cfg.trainable_config.type == "unimask" else contextlib.nullcontext()
-        with _without_imagenet_statistics(cfg), statistics:
+        with _without_imagenet_statistics(cfg):
             both = lerobots_make_both(cfg)
         if cfg.trainable_config.type == "unimask" and both[1] is not None:  # opened anew, each with its episodes
             for part in both:
@@ -140,20 +152,74 @@ def _without_imagenet_statistics(cfg: TrainPipelineConfig) -> Iterator[None]:
         cfg.dataset.use_imagenet_stats = asked
 
 
-def _say_in_a_line_what_decodes() -> None:
-    """Where FFmpeg is missing LeRobot logs a page about it whenever a dataset is opened, with videos or without.
+def _leave_out_unsound_statistics() -> None:
+    """LeRobot ends in an error of numpy's or torch's where an entry of meta/stats.json is no mapping to numbers, also
+    one of a column that no policy reads. Such entries are left out, and a line says so once; this policy computes those
+    that it reads.
 
-    Other policies: the same line once, instead of the page each time.
+    Other policies: do without such entries too; sound files are read as before.
     """
-    said: list[str] = []
+    load = dataset_metadata.load_stats
+    said: set[Path] = set()
 
-    def shorten(record: logging.LogRecord) -> bool:
-        line = record.getMessage().splitlines()[-1].replace(" (see the error above)", "")
-        record.msg, record.args = line, None
-        said.append(line)
-        return line not in said[:-1]
+    @functools.wraps(load)
+    def load_sound(root: Path) -> dict[str, dict[str, Any]] | None:
+        found = read_statistics(root)
+        wrong = [key for key, known in found.items() if not are_statistics(known)]
+        if not wrong:
+            return load(root) if found else None
+        if root not in said:
+            logger.warning("%s holds for %s what are no statistics: they are left out.", root, ", ".join(wrong))
+            said.add(root)
+        return cast_stats_to_numpy({key: known for key, known in found.items() if key not in wrong}) or None
 
-    logging.getLogger("lerobot.utils.import_utils").addFilter(shorten)
+    vars(dataset_metadata)["load_stats"] = load_sound
+
+
+def _say_in_a_line_what_decodes() -> None:
+    """Where FFmpeg is missing LeRobot logs a page about it whenever a dataset is opened, with videos or without. Now a
+    line says so once, when a process decodes a video.
+
+    Other policies: the same.
+    """
+    unsaid: list[str] = []
+    known: set[str] = set()
+    decode = video_utils.decode_video_frames_pyav
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno == logging.WARNING:
+            line = record.getMessage().splitlines()[-1].replace(" (see the error above)", "")
+            unsaid.extend({line} - known)
+            known.add(line)
+        return record.levelno != logging.WARNING
+
+    @functools.wraps(decode)
+    def decode_and_say(*arguments: Any, **settings: Any) -> Any:
+        with contextlib.suppress(IndexError):  # several threads decode
+            logger.warning(unsaid.pop())
+        return decode(*arguments, **settings)
+
+    logging.getLogger("lerobot.utils.import_utils").addFilter(keep)
+    vars(video_utils)["decode_video_frames_pyav"] = decode_and_say
+
+
+def _end_in_a_sentence() -> None:
+    """LeRobot's commands show a page of its own functions above the sentence with which this package refuses something.
+
+    Other policies, and errors that this package does not raise itself: unchanged. So is the exit status.
+    """
+    show = sys.excepthook
+
+    def say(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        command = Path(sys.argv[0]).name
+        by = Path(traceback.extract_tb(trace)[-1].filename if trace else "")
+        ours = by.is_relative_to(Path(__file__).parent) and issubclass(kind, ValueError | OSError | ArithmeticError)
+        if ours and command.startswith(("lerobot-", "lerobot_")):
+            print(f"{command}: error: {error}", file=sys.stderr)
+        else:
+            show(kind, error, trace)
+
+    sys.excepthook = say
 
 
 def _say_why_a_config_is_refused() -> None:

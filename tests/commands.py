@@ -12,7 +12,6 @@ import signal
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -98,7 +97,7 @@ def _be(main, words: list[str], cwd: Path, env: Mapping[str, str], out: io.TextI
         if isinstance(ended.code, str):
             print(ended.code, file=sys.stderr)
     except BaseException:
-        traceback.print_exc()
+        sys.excepthook(*sys.exc_info())
         status = 1
     with contextlib.suppress(Exception):
         sys.stdout.flush()

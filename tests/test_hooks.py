@@ -12,11 +12,12 @@ import pandas as pd
 import pytest
 import torch
 from accelerate import Accelerator
+from lerobot.datasets import video_utils
 from lerobot.scripts import lerobot_train
 from policies import CONTINUOUS_FEATURES, CONTINUOUS_STATS, TRAIN_FLAGS
 from torch import nn
 
-from lerobot_unimask import UniMASKPolicy
+from lerobot_unimask import UniMASKPolicy, lerobot_patches
 from lerobot_unimask.envs.configs import GymnasiumEnvConfig
 from lerobot_unimask.envs.returns import ReportReturn
 
@@ -161,12 +162,30 @@ def test_the_return_so_far_is_the_sum_of_rewards():
     assert env.reset(seed=0)[0]["return_so_far"] == 0
 
 
-def test_going_on_with_a_column_of_another_name_is_refused_with_the_command_that_renames_it(tiny_policy):
-    """LeRobot tells a policy nothing of --rename_map, and what is kept of a dataset is read from its files."""
-    policy = tiny_policy("gaussian")
+@pytest.mark.parametrize("states", [None, ["observation.state"]])
+def test_going_on_with_a_column_of_another_name_is_refused_with_the_command_that_renames_it(tiny_policy, states):
+    """What is kept of a dataset is read from its files."""
+    policy = tiny_policy("gaussian", states=states)
     renamed = {key.replace("state", "qpos"): entry for key, entry in CONTINUOUS_FEATURES.items()}
-    with pytest.raises(ValueError, match="unimask prepare --rename"):
+    with pytest.raises(ValueError, match=r"unimask prepare --rename OLD=observation\.state"):
         policy.config.set_dataset_feature_metadata(renamed)
+
+
+def test_a_training_with_other_names_is_refused_with_the_command_that_gives_them(tiny_policy, doorkey_root, tmp_path):
+    tiny_policy(states=["observation.state"]).save_pretrained(tmp_path / "policy")
+    result = commands.run(
+        "lerobot-train",
+        "--policy.path=policy",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/doorkey",
+        f"--dataset.root={doorkey_root}",
+        '--rename_map={"observation.qpos": "observation.state"}',
+        "--output_dir=run",
+        cwd=tmp_path,
+    )
+    assert result.status != 0
+    assert "unimask prepare --dataset.root=DIR --rename observation.qpos=observation.state" in result.stderr
+    assert "Traceback" not in result.stderr
 
 
 @pytest.mark.parametrize(("task", "message"), [(None, "env.task"), ("CartPole-v1", "continuous")])
@@ -203,10 +222,38 @@ def test_columns_that_cannot_be_states_are_refused(tiny_policy, states):
         tiny_policy("gaussian", features=COLUMNS, stats=CONTINUOUS_STATS, states=states)
 
 
-def test_lerobots_page_about_ffmpeg_is_one_line_said_once(caplog):
-    caplog.set_level(logging.WARNING, logger="lerobot.utils.import_utils")
+def test_lerobots_page_about_ffmpeg_is_one_line_said_once_where_a_video_is_read(caplog, tmp_path):
+    caplog.set_level(logging.WARNING)
     for _ in range(2):
         logging.getLogger("lerobot.utils.import_utils").warning(
             "A page.\nOf it.\nIt reads by pyav (see the error above)."
         )
-    assert caplog.messages == ["It reads by pyav."]
+        assert "A page" not in caplog.text
+        for _ in range(2):
+            with pytest.raises(FileNotFoundError):
+                video_utils.decode_video_frames_pyav(tmp_path / "none.mp4", [0.0], 0.1)
+    assert [line for line in caplog.messages if "reads by pyav" in line] == ["It reads by pyav."]
+
+
+def raised_by(code, name):
+    """The error that a piece of code raises, as one of a file of this name."""
+    try:
+        exec(compile(code, name, "exec"))
+    except Exception as error:
+        return type(error), error, error.__traceback__.tb_next
+
+
+@pytest.mark.parametrize(
+    ("command", "error", "file", "expected"),
+    [
+        ("bin/lerobot-train", "ValueError", lerobot_patches.__file__, "lerobot-train: error: x\n"),
+        ("lerobot_eval.py", "FloatingPointError", lerobot_patches.__file__, "lerobot_eval.py: error: x\n"),
+        ("bin/lerobot-train", "TypeError", lerobot_patches.__file__, "Traceback"),
+        ("bin/lerobot-train", "ValueError", "other.py", "Traceback"),
+        ("mine.py", "ValueError", lerobot_patches.__file__, "Traceback"),
+    ],
+)
+def test_lerobots_commands_end_in_a_sentence_of_ours(command, error, file, expected, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [command])
+    sys.excepthook(*raised_by(f"raise {error}('x')", file))
+    assert capsys.readouterr().err.startswith(expected)

@@ -1,6 +1,7 @@
 """`unimask prepare`: datasets as others record them, made into ones that train, resume and can be asked."""
 
 import json
+import os
 import shutil
 
 import commands
@@ -195,6 +196,47 @@ def test_an_old_format_is_refused_with_the_command_that_brings_it_up_to_date(old
     config = TrainPipelineConfig(DatasetConfig("me/robot", root=str(old)), policy=UniMASKConfig(device="cpu"))
     with pytest.raises(ValueError, match=r"v2\.1.*unimask prepare"):
         factory.make_dataset(config)
+
+
+@pytest.fixture
+def sound(blind, tmp_path):
+    """A dataset that needs nothing, and may be written to."""
+    copy = shutil.copytree(blind, tmp_path / "sound")
+    info = read_json(copy / "meta" / "info.json")
+    del info["features"]["observation.images.front"]
+    (copy / "meta" / "info.json").write_text(json.dumps(info))
+    return copy
+
+
+@pytest.mark.parametrize("names", [{"motors": JOINTS}, [JOINTS]])
+def test_nested_names_alone_need_nothing_and_become_plain_beside_other_steps(sound, tmp_path, names):
+    info = read_json(sound / "meta" / "info.json")
+    info["features"]["action"]["names"] = names
+    (sound / "meta" / "info.json").write_text(json.dumps(info))
+    assert make_plan(sound).why == []
+    made = prepare(sound, make_plan(sound, drop=["observation.state"]), output=tmp_path / "made")
+    assert read_json(made / "meta" / "info.json")["features"].keys() & {"action", "observation.state"} == {"action"}
+    assert read_json(made / "meta" / "info.json")["features"]["action"]["names"] == JOINTS
+
+
+def test_a_link_that_leads_nowhere_is_no_statistics(sound, tmp_path):
+    statistics = read_json(sound / "meta" / "stats.json")["action"]["std"]
+    (sound / "meta" / "stats.json").unlink()
+    (sound / "meta" / "stats.json").symlink_to("nowhere.json")
+    made = prepare(sound, make_plan(sound), output=tmp_path / "made")
+    np.testing.assert_allclose(read_json(made / "meta" / "stats.json")["action"]["std"], statistics, rtol=1e-5)
+    assert not (sound / "meta" / "nowhere.json").exists()
+
+
+def test_videos_that_are_links_lead_to_the_same_files(pictured, tmp_path):
+    """As in a snapshot of the Hub's cache, whose files are links to others."""
+    found = shutil.copytree(pictured, tmp_path / "found")
+    for number, path in enumerate(found.glob("videos/*/*/*.mp4")):
+        path.rename(tmp_path / f"{number}.blob")
+        path.symlink_to(os.path.relpath(tmp_path / f"{number}.blob", path.parent))
+    made = prepare(found, make_plan(found), output=tmp_path / "deep" / "er" / "made")
+    dataset, before = LeRobotDataset("me/robot", root=made), LeRobotDataset("me/robot", root=pictured)
+    assert torch.equal(dataset[17]["observation.images.image"], before[17]["image"])
 
 
 def test_joint_names_are_kept(renamed, blind, tmp_path):

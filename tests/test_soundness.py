@@ -215,6 +215,11 @@ DAMAGES = {
     "a column cut off": (table_changed(DATA, lambda table: table.drop_columns("action")), "action"),
     "texts for numbers": (table_changed(DATA, with_column("index", ["x"])), "x"),
     "rows of no episode": (table_changed(DATA, with_column("episode_index", [None, 0])), "episode_index"),
+    "rows of another episode": (table_changed(DATA, with_column("episode_index", [0, 1, 2])), "episode_index 1"),
+    "rows with another index": (table_changed(DATA, with_column("index", [1])), "index 1"),
+    "rows in another order": (table_changed(DATA, lambda t: t.take(list(range(599, -1, -1)))), "index 599"),
+    "a task before the first": (table_changed(DATA, with_column("task_index", [0, -1])), "task_index -1"),
+    "a task after the last": (table_changed(DATA, with_column("task_index", [0, 9])), "task_index 9"),
     "an episode elsewhere": (table_changed(EPISODES, with_column("dataset_from_index", [-7])), "-7"),
     "an episode too long": (table_changed(EPISODES, with_column("length", [200, 99, 200])), "99"),
     "lengths that are none": (table_changed(EPISODES, with_column("length", ["x"])), "length"),
@@ -281,6 +286,7 @@ def test_a_training_on_an_unsound_dataset_ends_before_its_first_step(root, tmp_p
     result = commands.run("lerobot-train", "--policy.type=unimask", *flags, *data, "--output_dir=run", cwd=tmp_path)
     assert result.status != 0
     assert "episode 0, frame 3" in result.stderr
+    assert "Traceback" not in result.stderr
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 

@@ -66,19 +66,18 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.name is not None and not labels:
         raise ValueError("--name is given without a label: add --return_to_go, --visits or --function.")
     plan = make_plan(arguments.root, **changes)
-    steps = [step for step in plan.why if not step.startswith("(not done)")]
     print("\n".join(plan.why) or f"{arguments.root} needs nothing to train.")
     if arguments.output is None and not arguments.replace:
-        if steps or labels:
+        if plan.steps or labels:
             print(
                 "Nothing has been written: --output=DIR writes the result there, --replace=true in the old one's place."
             )
         return
     root = arguments.root
-    if steps or not labels:
+    if plan.steps or not labels:
         root = prepare(arguments.root, plan, output=arguments.output)
     if labels:
-        root = _label(arguments, root, None if steps else arguments.output)
+        root = _label(arguments, root, None if plan.steps else arguments.output)
     print(f"written to {root}; videos are links to the same files where the disk allows it")
 
 

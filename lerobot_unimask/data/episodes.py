@@ -3,12 +3,10 @@
 Legend of shapes: B windows, K steps, E episodes.
 """
 
-import contextlib
 import logging
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any, NoReturn
@@ -17,10 +15,8 @@ import datasets
 import numpy as np
 import pandas as pd
 from datasets.features.features import string_to_arrow
-from lerobot.datasets import dataset_metadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.feature_utils import get_delta_indices
-from lerobot.datasets.io_utils import cast_stats_to_numpy
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -29,7 +25,7 @@ from torch.utils.data import default_collate
 
 from lerobot_unimask.data.factors import TEXTS
 from lerobot_unimask.data.reads import read_cameras
-from lerobot_unimask.data.soundness import are_statistics, data_files, episode_files, naming, outline, read_table
+from lerobot_unimask.data.soundness import data_files, episode_files, naming, outline, read_table
 from lerobot_unimask.records import read_json
 
 logger = logging.getLogger(__name__)
@@ -335,8 +331,7 @@ def open_checked(
     if there:
         check_format(place)
     try:
-        with sound_statistics():
-            dataset = open_it()
+        dataset = open_it()
     except (OSError, datasets.exceptions.DatasetGenerationError) as error:
         if there:
             check_whole(place, episodes)
@@ -346,32 +341,43 @@ def open_checked(
         raise
     if not there:
         check_format(Path(dataset.root))
+    check_rows(dataset)
     return dataset
 
 
-@contextlib.contextmanager
-def sound_statistics() -> Iterator[None]:
-    """LeRobot ends in an error of numpy's or torch's where an entry of meta/stats.json is no mapping to numbers. In
-    here such entries are left out, also those of columns that no policy reads; what is read is computed."""
-    load = dataset_metadata.load_stats
-
-    def load_sound(root: Path) -> dict[str, dict[str, Any]] | None:
-        found = read_statistics(root)
-        wrong = [key for key, known in found.items() if not are_statistics(known)]
-        if wrong:
-            _say_left_out(root, ", ".join(wrong))
-        return cast_stats_to_numpy({key: known for key, known in found.items() if key not in wrong}) or None
-
-    vars(dataset_metadata)["load_stats"] = load_sound
-    try:
-        yield
-    finally:
-        vars(dataset_metadata)["load_stats"] = load
-
-
-@cache
-def _say_left_out(root: Path, columns: str) -> None:
-    logger.warning("%s holds for %s what are no statistics: what is read of them is computed.", root, columns)
+def check_rows(dataset: LeRobotDataset) -> None:
+    """
+    Raises:
+        ValueError: a row stands elsewhere than its index and the metadata of the episodes say, or names a task that
+            there is not. (LeRobot would take other frames, or another text, for what it is to read.)
+    """
+    rows, episodes = dataset.hf_dataset.data, dataset.meta.episodes
+    first, end = (np.asarray(episodes[key]) for key in ("dataset_from_index", "dataset_to_index"))
+    numbers = np.arange(len(first)) if dataset.episodes is None else np.unique(dataset.episodes)
+    numbers = numbers[np.argsort(first[numbers], kind="stable")]
+    lengths = end[numbers] - first[numbers]
+    before = np.repeat(np.cumsum(lengths) - lengths, lengths)  # rows of earlier episodes
+    expected = {
+        "index": np.repeat(first[numbers], lengths) + np.arange(len(before)) - before,
+        "episode_index": np.repeat(numbers, lengths),
+    }
+    for key, there in expected.items():
+        found = rows.column(key).to_numpy()
+        if not np.array_equal(found, there):
+            short = min(len(found), len(there))
+            at = next(iter(np.flatnonzero(found[:short] != there[:short])), short)
+            has, should = (column[at] if at < len(column) else "none" for column in (found, there))
+            raise ValueError(
+                f"Row {at} of {dataset.root} has {key} {has}, and by meta/episodes it is {should}: fetch its tables "
+                "anew."
+            )
+    tasks, count = rows.column("task_index").to_numpy(), len(dataset.meta.tasks)
+    wrong = np.flatnonzero(~((tasks >= 0) & (tasks < count)))
+    if len(wrong):
+        raise ValueError(
+            f"Row {wrong[0]} of {dataset.root} has task_index {tasks[wrong[0]]}, and {TASKS} has {count} tasks: fetch "
+            "what is damaged anew."
+        )
 
 
 def read_statistics(root: Path) -> dict[str, Any]:

@@ -359,7 +359,10 @@ def group_features(
         states = [key for key in (STATE, ENVIRONMENT_STATE) if key in found]
     for key in states:
         if key not in columns or states.count(key) > 1:
-            raise ValueError(f"states names {key!r}; name each of its columns once, of {', '.join(columns) or 'none'}.")
+            raise ValueError(
+                f"states names {key!r}; name each of its columns once, of {', '.join(columns) or 'none'}, or give one "
+                f"that name: `unimask prepare --rename OLD={key}`."
+            )
     taken = (*states, STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are no properties
     if not states:
         raise ValueError(

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from filelock import FileLock
+from lerobot.datasets import video_utils
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.video_utils import VideoDecoderCache, decode_video_frames_pyav, decode_video_frames_torchcodec
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 from torchvision.transforms.v2.functional import resize
@@ -189,9 +189,9 @@ def _decode_video(dataset: LeRobotDataset, key: str, episode: int, rows: range) 
     path = dataset.root / dataset.meta.get_video_file_path(episode, key)
     wanted = [begin + float(time) for time in times]
     if dataset._video_backend != "torchcodec":
-        return decode_video_frames_pyav(path, wanted, dataset.tolerance_s, return_uint8=True)
+        return video_utils.decode_video_frames_pyav(path, wanted, dataset.tolerance_s, return_uint8=True)
     if not hasattr(_own, "decoders"):
-        _own.decoders = VideoDecoderCache(max_size=1)
-    return decode_video_frames_torchcodec(
+        _own.decoders = video_utils.VideoDecoderCache(max_size=1)
+    return video_utils.decode_video_frames_torchcodec(
         path, wanted, dataset.tolerance_s, decoder_cache=_own.decoders, return_uint8=True
     )
