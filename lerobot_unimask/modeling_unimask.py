@@ -170,7 +170,7 @@ class UniMASKPolicy(PreTrainedPolicy):
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         """What --peft adapts, of whichever network: its linear layers."""
-        linear = r"query_key_value|project|feedforward\.[02]|hidden\.\d+\.0|numbers|returns|stack|heads\.\w+"
+        linear = r"query_key_value|project|feedforward\.[02]|hidden\.\d+\.0|numbers|returns|stack|out|heads\.\w+"
         return {"target_modules": rf"network\.(.*\.)?({linear})"}
 
     def get_optim_params(self) -> Iterable[torch.nn.Parameter] | list[dict[str, Any]]:

@@ -167,6 +167,15 @@ def test_a_truncated_or_absent_file_is_refused(tiny_policy, tmp_path):
         UniMASKPolicy.from_pretrained(tmp_path)
 
 
+@pytest.mark.parametrize("find", [lambda run: run, lambda run: checkpoints_of(run)[-1]], ids=["a run", "its last"])
+def test_an_adapter_is_said_to_be_one(run, find):
+    """LeRobot saves a fine-tuning with --peft so."""
+    for weights in run.glob("checkpoints/*/*/model.safetensors"):
+        weights.rename(weights.with_name("adapter_model.safetensors"))
+    with pytest.raises(ValueError, match=r"PEFT adapter.*merge_and_unload"):
+        UniMASKPolicy.from_pretrained(find(run))
+
+
 RESCALED = {
     key: {name: [10 * number for number in numbers] for name, numbers in entry.items()}
     for key, entry in CONTINUOUS_STATS.items()

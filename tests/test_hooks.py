@@ -21,6 +21,8 @@ from lerobot_unimask import UniMASKPolicy, lerobot_patches
 from lerobot_unimask.envs.configs import GymnasiumEnvConfig
 from lerobot_unimask.envs.returns import ReportReturn
 
+TOP = {"dtype": "image", "shape": (32, 32, 3), "names": ["height", "width", "channels"]}
+
 
 @pytest.mark.parametrize("masks", ["random_mask", "past"])
 def test_the_mean_over_windows_is_the_loss(tiny_policy, batch_of, kind, masks):
@@ -82,9 +84,18 @@ def test_lerobot_train_learns_from_what_makes_progress_alone(doorkey_root, tmp_p
     torch.testing.assert_close(torch.stack(learnt), torch.stack(losses), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("network", ["transformer", "feedforward", "decision_transformer"])
-def test_adapters_go_to_every_linear_layer(tiny_policy, network):
-    policy = tiny_policy("continuous", network=network, attention=None)
+@pytest.mark.parametrize(
+    ("network", "cameras"),
+    [
+        ("transformer", {}),
+        ("transformer", {"observation.images.top": TOP}),
+        ("feedforward", {}),
+        ("decision_transformer", {}),
+    ],
+)
+def test_adapters_go_to_every_linear_layer(tiny_policy, network, cameras):
+    features = {**CONTINUOUS_FEATURES, **cameras}
+    policy = tiny_policy("continuous", network=network, attention=None, features=features, image_size=[32, 32])
     pattern = policy._get_default_peft_targets()["target_modules"]
     linear = {name for name, module in policy.named_modules() if isinstance(module, nn.Linear)}
     assert {name for name, _ in policy.named_modules() if re.fullmatch(pattern, name)} == linear

@@ -12,6 +12,7 @@ from lerobot_unimask.data.episodes import provenance_of
 from lerobot_unimask.records import read_json
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"  # lerobot's names, in this order of being written
+ADAPTER = "adapter_model.safetensors"  # PEFT's, in the weights' place
 MAX_FAULTS = 20  # named in one error
 
 
@@ -23,7 +24,7 @@ def checkpoints_of(run: Path) -> list[Path]:
     """
     if (run / CONFIG).exists():
         return [run]
-    found = [path.parent for path in run.glob(f"checkpoints/*/pretrained_model/{WEIGHTS}")]
+    found = [path.parent for path in run.glob(f"checkpoints/*/pretrained_model/{CONFIG}")]
     found = [path for path in found if path.parent.name.isdecimal() and _is_whole(path)]
     if not found:
         raise FileNotFoundError(
@@ -35,10 +36,9 @@ def checkpoints_of(run: Path) -> list[Path]:
 
 def _is_whole(checkpoint: Path) -> bool:
     """Whether all that acting needs has been written; of the weights the header is read, which says where they end."""
-    if not (checkpoint / CONFIG).exists():
-        return False
+    adapter = (checkpoint / ADAPTER).exists()
     try:
-        with safe_open(checkpoint / WEIGHTS, framework="pt"):
+        with safe_open(checkpoint / (ADAPTER if adapter else WEIGHTS), framework="pt"):
             return True
     except (SafetensorError, OSError):
         return False
@@ -98,8 +98,15 @@ def check_header(file: Path, expected: Mapping[str, Tensor]) -> None:
     the weights are known to have them.
 
     Raises:
-        ValueError: the file is not one of safetensors, or lacks one of these tensors or has it in another shape.
+        ValueError: the file is not one of safetensors, or lacks one of these tensors or has it in another shape; or
+            there is an adapter in its place.
     """
+    if not file.exists() and (file.parent / ADAPTER).exists():
+        raise ValueError(
+            f"{file.parent} holds a PEFT adapter, which lerobot-train and lerobot-eval load beside its base policy. "
+            "To be asked it has to be merged: PeftModel.from_pretrained(UniMASKPolicy.from_pretrained(BASE), "
+            "ADAPTER).merge_and_unload().save_pretrained(DIR)."
+        )
     try:
         with safe_open(file, framework="pt") as weights:
             shapes = {name: tuple(weights.get_slice(name).get_shape()) for name in weights.keys()}  # noqa: SIM118
