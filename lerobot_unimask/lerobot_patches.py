@@ -81,10 +81,10 @@ def _read_as_this_policy_needs() -> None:
     for ever, with `--num_workers=0`, and heed neither `--dataset.episodes` nor `drop_n_last_frames`. So is a
     rename_map: LeRobot tells a policy nothing of it, and what is kept of a dataset is read from its files. And a
     dataset that is read in batches gets no DataLoader workers, of which LeRobot starts four: each imports LeRobot
-    first, some 20 s, for batches that take a millisecond, and from the second epoch on they see another order of the
-    data. Of cameras, those that the policy reads are decoded once, others not at all; LeRobot decodes all of a window's
-    frames of all of them at each read. Columns of texts, which cannot be read in batches, are left out. And a policy is
-    to know which episodes are read, where LeRobot tells it of all of them.
+    first, some 20 s, for batches that take a millisecond, and beside them dropout draws other numbers. Of cameras,
+    those that the policy reads are decoded once, others not at all; LeRobot decodes all of a window's frames of all of
+    them at each read. Columns of texts, which cannot be read in batches, are left out. And a policy is to know which
+    episodes are read, where LeRobot tells it of all of them.
 
     Other policies: unchanged.
     """
