@@ -166,14 +166,7 @@ def make_plan(
         if fault or old in plan.flatten:
             plan.statistics.append(new)
             plan.why.append(f"statistics of {new}: {fault or 'those in meta/stats.json have its old shape'}.")
-    left = {plan.rename.get(key, key) for key in features if key not in plan.drop}
-    if ACTION not in left:
-        plan.why.append(f"(not done) no column is called {ACTION}: --rename OLD={ACTION} gives one that name.")
-    if not left & {OBS_STATE, OBS_ENV_STATE}:
-        plan.why.append(
-            f"(not done) no column is called {OBS_STATE}: --rename OLD={OBS_STATE} gives one that name, or train with "
-            f"--policy.states and columns called {OBS_PREFIX}*."
-        )
+    plan.why += _not_done({plan.rename.get(key, key): entry for key, entry in features.items() if key not in plan.drop})
     for key, count in (categories or {}).items():
         plan.categories[plan.rename.get(key, key)] = count if count == AUTO else int(count)
         plan.why.append(f"--categories {key}={count}.")
@@ -181,6 +174,19 @@ def make_plan(
     if nested and plan.steps:
         plan.why.append(f"names of {', '.join(nested)}: they are nested, which alone would not matter.")
     return plan
+
+
+def _not_done(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What policies miss among the columns as they will be, and only the user can name."""
+    numbers, why = {key for key, entry in features.items() if entry["dtype"] not in (*PICTURES, *TEXTS)}, []
+    if ACTION not in numbers:
+        why.append(f"(not done) no column of numbers is called {ACTION}: --rename OLD={ACTION} gives one that name.")
+    if not numbers & {OBS_STATE, OBS_ENV_STATE}:
+        why.append(
+            f"(not done) no column of numbers is called {OBS_STATE}: --rename OLD={OBS_STATE} gives one that name, or "
+            f"train with --policy.states and columns called {OBS_PREFIX}*."
+        )
+    return why
 
 
 def _is_nested(entry: Mapping[str, Any]) -> bool:

@@ -344,7 +344,7 @@ class UniMASKConfig(PreTrainedConfig):
             ValueError: the dataset has no action or no state, or is not one that a loaded checkpoint can go on with.
         """
         found = {key: read_feature(key, entry) for key, entry in dataset_features.items() if is_numeric(entry)}
-        check_layout(dataset_features)
+        check_layout(dataset_features, self.states)
         features = group_features(found, self.properties, self.states)
         pictures = self._named_cameras(dataset_features, features)
         tasks = {name: columns for name, columns in self.features.items() if name == TASK}  # not among the columns

@@ -124,6 +124,21 @@ def test_states_and_actions_are_needed(key):
         make(input_features=features).validate_features()
 
 
+@pytest.mark.parametrize("key", ["action", "observation.state"])
+@pytest.mark.parametrize("dtype", ["string", "image"])
+def test_texts_and_pictures_are_no_states_and_no_actions(key, dtype):
+    entries = {name: entry for name, entry in ENTRIES.items() if name != "observation.environment_state"}
+    entries[key] = {"dtype": dtype, "shape": (8, 8, 3) if dtype == "image" else (1,), "names": None}
+    with pytest.raises(ValueError, match=f"no '{key}' of numbers"):
+        make(cameras=[]).set_dataset_feature_metadata(entries)
+
+
+def test_other_states_of_two_dimensions_are_said_to_be_ones():
+    entries = {**ENTRIES, "observation.grid": {"dtype": "float32", "shape": (4, 4), "names": None}}
+    with pytest.raises(ValueError, match=r"observation\.grid has shape \(4, 4\).*unimask prepare"):
+        make(states=["observation.grid"]).set_dataset_feature_metadata(entries)
+
+
 def test_declared_features_serve_where_no_dataset_was_read():
     config = make(
         input_features={

@@ -351,8 +351,12 @@ def test_a_format_that_lerobot_does_not_convert_is_named(blind, tmp_path, versio
 
 
 @pytest.mark.parametrize("gone", ["action", "observation.state"])
-def test_a_column_that_a_policy_needs_is_missed(blind, gone):
+def test_a_column_that_a_policy_needs_is_missed(blind, sound, gone):
     assert gone not in " ".join(make_plan(blind).why)
+    info = read_json(sound / "meta" / "info.json")
+    info["features"][gone] |= {"dtype": "string", "shape": [1], "names": None}
+    (sound / "meta" / "info.json").write_text(json.dumps(info))
+    assert f"--rename OLD={gone}" in " ".join(make_plan(sound).why)
     assert f"--rename OLD={gone}" in " ".join(make_plan(blind, drop=[gone]).why)
 
 

@@ -275,7 +275,15 @@ def test_rows_of_different_lengths_are_named(root):
     rows = table.column("action").to_pylist()
     ragged = pa.array([*rows[:-1], rows[-1][:1]], pa.list_(pa.float32()))
     pq.write_table(table.set_column(table.column_names.index("action"), "action", ragged), path)
-    with pytest.raises(ValueError, match="action"):
+    with pytest.raises(ValueError, match=rf"action has 1 numbers in row {len(table) - 1} .* 2 in most"):
+        policy_of(root)
+
+
+@pytest.mark.parametrize("kind", [pa.list_(pa.float32()), pa.list_(pa.float32(), 2)], ids=["a list", "as many each"])
+def test_a_row_that_holds_nothing_is_named(root, kind):
+    cells = pa.array([None if i % 8 == 7 else [0.0, 1.0] for i in range(600)], kind)
+    table_changed(DATA, lambda table: table.set_column(table.column_names.index("action"), "action", cells))(root)
+    with pytest.raises(ValueError, match="action has 0 numbers in row 7 "):
         policy_of(root)
 
 

@@ -302,13 +302,13 @@ def read_feature(key: str, entry: dict[str, Any]) -> Feature:
     )
 
 
-def check_layout(entries: Mapping[str, Mapping[str, Any]]) -> None:
+def check_layout(entries: Mapping[str, Mapping[str, Any]], states: Sequence[str] | None = None) -> None:
     """What `unimask prepare` mends in a dataset's states and actions.
 
     Raises:
         ValueError: one of them has two dimensions.
     """
-    for key in (STATE, ENVIRONMENT_STATE, ACTION):
+    for key in (*(states or (STATE, ENVIRONMENT_STATE)), ACTION):
         entry = entries.get(key)
         if entry is None:
             continue
@@ -365,13 +365,14 @@ def group_features(
             )
     taken = (*states, STATE, ENVIRONMENT_STATE, RETURN_TO_GO)  # columns that are no properties
     if not states:
+        instead = f"--policy.states names others of {', '.join(columns)}" if columns else "pictures are not enough"
         raise ValueError(
-            f"The dataset has no {STATE!r}: UniMASK models states and actions. It has {list(found)}; "
-            f"`unimask prepare --rename OLD={STATE}` renames a column, --policy.states names others of {OBS_PREFIX}*."
+            f"The dataset has no {STATE!r} of numbers: UniMASK models states and actions. Of numbers it has "
+            f"{', '.join(found)}; `unimask prepare --rename OLD={STATE}` renames a column, {instead}."
         )
     if ACTION not in found:
         raise ValueError(
-            f"The dataset has no {ACTION!r}: UniMASK models states and actions. It has {list(found)}; "
+            f"The dataset has no {ACTION!r} of numbers: UniMASK models states and actions. It has {', '.join(found)}; "
             f"`unimask prepare --rename OLD={ACTION}` renames a column."
         )
     features = {"s": [found[key] for key in states], "a": [found[ACTION]]}

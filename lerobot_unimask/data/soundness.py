@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from numpy.typing import ArrayLike
@@ -120,7 +121,16 @@ def _numbers(
         rows = rows[np.isin(table.column("episode_index").to_numpy(), list(episodes))]
         table = table.take(rows)
     for key in found if len(table) else ():
-        column = innermost(table.column(key).combine_chunks())
+        cells = table.column(key).combine_chunks()
+        column, variable = innermost(cells), pa.types.is_list(cells.type) or pa.types.is_large_list(cells.type)
+        if variable or (cells.null_count and pa.types.is_fixed_size_list(cells.type)):
+            lengths = pc.fill_null(pc.list_value_length(cells), 0).to_numpy(zero_copy_only=False)
+            odd = np.flatnonzero(lengths != np.median(lengths))
+            if len(odd):
+                raise ValueError(
+                    f"{key} has {lengths[odd[0]]} numbers in row {rows[odd[0]]} of {path}, and {np.median(lengths):g} "
+                    "in most: mend the data."
+                )
         if column.null_count:  # NaN, where Arrow would make objects of whole numbers and booleans
             column = column.cast(pa.float64())
         if len(column) % len(table):
