@@ -26,7 +26,7 @@ def draw(axes: Axes, windows: Mapping[str, Mapping[int, Mapping[str, float]]], v
     axes.set_xticks(range(len(every)), map(str, every))
     axes.set_xlabel("steps that acting remembers, h")
     axes.grid(color=FAINT)
-    axes.legend(fontsize=SMALL, frameon=False)
+    axes.legend(fontsize=SMALL, frameon=False, loc="upper left", bbox_to_anchor=(0, -0.2))
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
         remembers = {int(h): found for h, found in run["remembers"].items()}
         name = f"K = {run['context_length']}, {run['updates']:,} updates"
         tasks.setdefault(run["task"], {})[name] = {run["context_length"]: run} | remembers
-    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
     for axes, (task, windows) in zip(figure.subplots(1, len(tasks)), tasks.items(), strict=True):
         value = "mean_return" if task == "maze2d" else "success"
         draw(axes, windows, value)
