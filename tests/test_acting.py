@@ -364,9 +364,11 @@ def test_a_question_changed_in_the_settings_takes_effect_at_the_next_step(tiny_p
         assert torch.equal(policy.select_action({"observation.state": state}), by_call[step])
 
 
+@pytest.mark.parametrize("mask", ["behavior_cloning", "a[t] | s[:t+1]"])
 @pytest.mark.parametrize("attention", ["both", "causal", "bidirectional"])
-def test_what_a_sliding_window_keeps_changes_no_action(attention, tiny_policy):
-    policy = tiny_policy("gaussian", context_length=6, attention=attention, training_masks="behavior_cloning")
+def test_what_a_sliding_window_keeps_changes_no_action(attention, mask, tiny_policy):
+    asked = {"attention": attention, "training_masks": mask, "inference_mask": mask}
+    policy = tiny_policy("gaussian", context_length=6, **asked)
     states, actions = Episode("gaussian", 8, 16).states, []
     for keeps in (True, False):
         policy.reset()
@@ -375,3 +377,15 @@ def test_what_a_sliding_window_keeps_changes_no_action(attention, tiny_policy):
                 policy._memory.cache = type(policy._memory.cache)()
             actions.append(policy.select_action({"observation.state": state}))
     torch.testing.assert_close(torch.stack(actions[16:]), torch.stack(actions[:16]), rtol=1e-5, atol=1e-5)
+
+
+def test_past_actions_that_are_not_shown_change_no_action(tiny_policy):
+    mask = "a[t] | s[:t+1]"
+    policy = tiny_policy("gaussian", context_length=6, attention="causal", training_masks=mask, inference_mask=mask)
+    states, actions = Episode("gaussian", 8, 16).states, []
+    for past in (0.0, 5.0):
+        policy.reset()
+        for state in states:
+            actions.append(policy.select_action({"observation.state": state}))
+            policy._memory.values["a"][:, policy._memory.position] = past
+    assert torch.equal(torch.stack(actions[:16]), torch.stack(actions[16:]))

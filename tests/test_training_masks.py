@@ -254,17 +254,18 @@ def test_a_causal_window_asks_a_question_at_every_step_at_once():
     assert mask.shown["rtg"][0].tolist() == [True, False, False, False]
 
 
-def test_causality_keeps_the_steps_of_a_causal_window_apart():
+@pytest.mark.parametrize("task", ["behavior_cloning", "reward_conditioned", "a[t] | s[:t+1]", "a[t] | s[:t+1], rtg[0]"])
+def test_causality_keeps_the_steps_of_a_causal_window_apart(task):
     """For every t, what a causal window shows before a[t] is what the question at t shows."""
     K, factors = 4, ("s", "a", "rtg")
-    for task in ("behavior_cloning", "reward_conditioned"):
-        _, union = causal_masks(task, B=1)
-        table = tabulate(task, factors, K)
-        for row, t in enumerate(table.t.tolist()):
-            before = {"s": t + 1, "a": t, "rtg": K}
-            for f, name in enumerate(factors):
-                assert torch.equal(union.shown[name][0, : before[name]], table.shown[row, f, : before[name]])
-                assert not table.shown[row, f, before[name] :].any()
+    _, union = causal_masks(task, B=1)
+    assert union.asked["a"].all()
+    table = tabulate(task, factors, K)
+    for row, t in enumerate(table.t.tolist()):
+        before = {"s": t + 1, "a": t, "rtg": K}
+        for f, name in enumerate(factors):
+            assert torch.equal(union.shown[name][0, : before[name]], table.shown[row, f, : before[name]])
+            assert not table.shown[row, f, before[name] :].any()
 
 
 def test_causal_random_masking_asks_for_every_token_and_shows_half_of_the_properties():
@@ -294,6 +295,8 @@ def test_without_a_causal_form_nothing_is_causal_or_the_mask_is_refused():
     assert mask.causal is False
     with pytest.raises(MaskError, match="behavior_cloning"):
         causal_masks(["behavior_cloning", "future"], share=1.0)
+    for text in ("s[0] | rtg[0]", "a[t] | s[t]", "a[t] | s[t:]", "a[t], s[t+1] | s[:t+1]"):
+        assert causal_masks(text, share=0.5)[1].causal is False
 
 
 @pytest.mark.parametrize(
@@ -311,6 +314,12 @@ def test_without_a_causal_form_nothing_is_causal_or_the_mask_is_refused():
         ("behavior_cloning", "reward_conditioned", 2, {"a": [], "s": []}),  # it has not learnt that
         ("behavior_cloning", "s[3] | s[:3], a[:3]", None, {"a": [], "s": []}),
         ("past", "behavior_cloning", 2, {"a": [], "s": []}),
+        ("random_mask", "a[t] | s[:t+1]", 2, {"a": [], "s": []}),  # it shows every action before
+        (["random_mask", "a[t] | s[:t+1]"], "a[t] | s[:t+1]", 2, {"a": [2], "s": []}),
+        (["random_mask", "a[t] | s[:t+1]"], "behavior_cloning", 2, {"a": [2], "s": []}),
+        (["random_mask", "a[t] | s[:t+1]"], "a[2:] | s[:3]", None, {"a": [2], "s": []}),
+        ("a[t] | s[:t+1]", "behavior_cloning", 2, {"a": [], "s": []}),
+        ("a[t] | s[t]", "a[t] | s[t]", 2, {"a": [], "s": []}),  # another t shows another state
     ],
 )
 def test_what_is_answered_causally(masks, text, t, causally):

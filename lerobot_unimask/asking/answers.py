@@ -365,8 +365,8 @@ def predict(model: LearntModel, window: Window, mask: Mask, cache: Cache | None 
     if model.config.attention == "causal":
         raise MaskError(
             "This model attends causally alone. It was trained on "
-            f"{', '.join(model.training_masks.weights)}, and asks for one token given every state, picture and "
-            "action before it. A model of attention=both answers any question.",
+            f"{', '.join(model.training_masks.weights)}, and answers for one token given all of that which is shown "
+            "before it. A model of attention=both answers any question.",
             mask.draw(),
         )
     predictions = network(window, mask.shown, False, asked=mask.asked)

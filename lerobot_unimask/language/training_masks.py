@@ -20,10 +20,10 @@ class TrainingMasks(nn.Module):
     """Draws one mask per window from a mixture of questions and random masking, without a loop over windows.
 
     A causal window carries all t of a question at once: what any of them shows is shown, and causality keeps them
-    apart. That holds for questions that ask for one token and show all states and actions before it, as behaviour
-    cloning does, and of pictures those before it, or the same ones for all t. The causal form of random masking shows
-    all of these, each property with probability 1/2, and asks for every state and action but the first state: nothing
-    comes before a property either, so none is asked causally.
+    apart. That holds for questions that ask for one token and show nothing after it, and before it the same tokens for
+    all t: all states and actions, as behaviour cloning does, or the states alone, `a[t] | s[:t+1]`. The causal form of
+    random masking shows all of these, each property with probability 1/2, and asks for every state and action but the
+    first state: nothing comes before a property either, so none is asked causally.
 
     Args:
         masks: one text, a list (equal weights), or a mapping from texts to weights. Each text is a question, the name
@@ -91,9 +91,9 @@ class TrainingMasks(nn.Module):
         if causal_share == 1 and not capable.all():
             text = list(self.weights)[forms.index(None)]
             raise MaskError(
-                "A model that attends causally alone is trained on questions that ask for one token and show every "
-                "state and action before it, such as behavior_cloning, reward_conditioned or random_mask; this one "
-                "is not.",
+                "A model that attends causally alone is trained on random_mask, or on questions that ask for one token "
+                "and show nothing after it, and before it the same for every t, such as behavior_cloning or "
+                "a[t] | s[:t+1]; this one is not.",
                 TASKS.get(text, text),
             )
         self.causal_share = causal_share if capable.any() else 0.0
@@ -116,34 +116,35 @@ class TrainingMasks(nn.Module):
             asked[~self.lasting[:, 0]] = False
             shown[~self.lasting[:, 0], 1:] = False
             return shown, asked
-        mask = table.masks()
-        following = mask.next_tokens(self.cameras)
-        if any((following[name] != asked).any() for name, asked in mask.asked.items()):
-            return None
+        place = self._places(K)
+        at = torch.where(table.asked, place, -1).amax((1, 2))  # (R,) of the token that each t asks for
         shown = table.shown.any(0)
-        for name in self.cameras:  # all t share a window's pictures, those before each
-            if (mask.shown[name] != (shown[self.factors.index(name)] & mask.shown["s"])).any():
-                return None
-        return shown, table.asked.any(0)
+        alone = (table.asked.sum((1, 2)) == 1) & (at > 0)  # nothing of the window stands before s[0]
+        apart = (table.shown == shown & (place < at[:, None, None])).all()
+        return (shown, table.asked.any(0)) if alone.all() and apart else None
+
+    def _places(self, K: int) -> Tensor:
+        """Where each token stands among those of a window, (F, K); properties before them all."""
+        order = ["s", *self.cameras, "a"]
+        steps = len(order) * torch.arange(K)
+        return torch.stack([steps + order.index(n) if n in order else torch.full((K,), -1) for n in self.factors])
 
     def answered_causally(self, mask: Mask) -> dict[str, Tensor]:
         """factor -> (B, K) bool: the asked tokens that follow what is shown, where the model has learnt to predict them
         causally. All else it answers in both directions."""
-        following = mask.next_tokens(self.cameras)
+        whole = torch.zeros(len(mask.shown["s"]), dtype=torch.bool, device=self.causal_row.device)
         if self.causal_share > 0 and self.random_task is not None:
-            if not self.cameras:
-                return following
-            whole = torch.stack([mask.shown[name] == mask.shown["s"] for name in self.cameras]).all(0).all(1)
-            if whole.all():
-                return following
-        else:
-            whole = torch.zeros(len(mask.shown["s"]), dtype=torch.bool, device=self.causal_row.device)
+            pictures = [mask.shown[name] == mask.shown["s"] for name in self.cameras]
+            whole = torch.stack([~whole, *(same.all(1) for same in pictures)]).all(0)
+        following = mask.next_tokens(self.cameras)
+        if whole.all() and not len(self.shown):
+            return following
         learnt = self.causal_row & (self.causal_share > 0)  # (R,)
         shown = torch.stack([mask.shown[name] for name in self.factors], dim=1)  # (B, F, K)
-        same = (shown[:, None] == self.shown).all((2, 3)) & learnt  # (B, R)
+        same = ((shown[:, None] == self.shown).all((2, 3)) & learnt).float()  # (B, R)
         return {
-            name: tokens & (whole[:, None] | (same.float() @ self.asked[:, self.factors.index(name)].float() > 0))
-            for name, tokens in following.items()
+            name: (tokens & whole[:, None]) | (mask.asked[name] & (same @ self.asked[:, f].float() > 0))
+            for f, (name, tokens) in enumerate(following.items())
         }
 
     def forward(self, valid: Tensor, index: Tensor, *, seed: int, step: Tensor | int) -> Mask:
