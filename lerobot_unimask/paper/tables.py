@@ -107,12 +107,12 @@ def _beside_the_optimum(record: Record) -> str:
     return markdown_table(("task", "this policy", "best possible", "difference"), rows)
 
 
-def _above_the_optimum(*records: Record) -> str:
-    def above(record: Record, task: str) -> str:
-        return f"{record['mean'][task] - record['optimum']['losses'][task]:.3f}"
-
-    rows = ((f"`{task}`", *(above(record, task) for record in records)) for task in TASKS)
-    return markdown_table(("nats above the optimum", "24 November", "second seed", "28 November"), rows)
+def _above_the_optimum(record: Record) -> str:
+    """A column for each run, by the commit that trained it, and a last row of its mean over the tasks."""
+    found = {task: [run["above_optimum"][task] for run in record["runs"]] for task in TASKS}
+    mean = ("mean", *(f"{statistics.mean(column):.3f}" for column in zip(*found.values(), strict=True)))
+    rows = ((f"`{task}`", *(f"{above:.3f}" for above in of_runs)) for task, of_runs in found.items())
+    return markdown_table(("nats above the optimum", *(run["commit"][:7] for run in record["runs"])), [*rows, mean])
 
 
 def _causal_share(both: Record, both_1: Record, random: Record, random_1: Record, stacked: Record) -> str:
