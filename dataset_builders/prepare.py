@@ -98,7 +98,7 @@ def make_plan(
         categories: column -> how many, or `auto`.
 
     Raises:
-        FileNotFoundError: there is no dataset in `root`.
+        FileNotFoundError: there is no dataset in `root`, or what LeRobot's converter reads of one is missing.
         ValueError: a column that there is not, or a name that is taken.
     """
     check_folder(root)
@@ -114,6 +114,11 @@ def make_plan(
     if not str(info.get("codebase_version", "")).startswith("v3"):
         plan.convert = True
         plan.why.append(f"convert: the format is {info.get('codebase_version')}, and LeRobot reads v3.0.")
+        for name in ("tasks", "episodes", "episodes_stats"):
+            if not (root / "meta" / f"{name}.jsonl").exists():
+                raise FileNotFoundError(
+                    f"{root} lacks meta/{name}.jsonl, which LeRobot's converter reads: copy or fetch it anew."
+                )
     for wanted, others in OTHER_NAMES.items():
         found = [name for name in others if name in features and name not in asked]
         have = wanted in features or (wanted == OBS_STATE and OBS_ENV_STATE in features)

@@ -340,6 +340,14 @@ def test_texts_of_tasks_get_the_places_where_lerobot_looks_for_them(pictured, tm
     assert [dataset[sum(LENGTHS[:episode])]["task"] for episode in range(3)] == ["wave 0", "wave 1", "wave 0"]
 
 
+@pytest.mark.parametrize("name", ["tasks", "episodes", "episodes_stats"])
+def test_what_the_converter_misses_is_named_before_anything_is_converted(old, tmp_path, name):
+    copy = shutil.copytree(old, tmp_path / "data")
+    (copy / "meta" / f"{name}.jsonl").unlink()
+    with pytest.raises(FileNotFoundError, match=rf"meta/{name}\.jsonl.*fetch it anew"):
+        make_plan(copy)
+
+
 @pytest.mark.parametrize("version", ["v1.6", "v2.0"])
 def test_a_format_that_lerobot_does_not_convert_is_named(blind, tmp_path, version):
     copy = shutil.copytree(blind, tmp_path / "data")
