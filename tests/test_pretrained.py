@@ -75,7 +75,7 @@ def test_doorkeys_answers_are_near_the_optimum():
     policy = UniMASKPolicy.from_pretrained("doorkey")
     optimum, (distance,) = beside_optimum([policy], batch, list(TASKS), "paper")
     for task, apart in distance["divergence"].items():
-        assert apart < 0.08 * optimum["expected_losses"][task] + 0.005, task
+        assert apart < 0.03 * optimum["expected_losses"][task] + 0.005, task
     with torch.no_grad():
         foretold = foretold_properties(policy, batch)["rtg"]
     for said, exact in zip(foretold, optimum["foretold"]["rtg"], strict=True):
@@ -83,7 +83,7 @@ def test_doorkeys_answers_are_near_the_optimum():
 
 
 def test_doorkeys_card_says_what_was_measured():
-    card = (FOLDERS["doorkey"] / "README.md").read_text()
+    card = " ".join((FOLDERS["doorkey"] / "README.md").read_text().split())
     found = json.loads((ROOT / "docs/results/doorkey_pretrained.json").read_text())
     for task, apart in found["runs"][0]["divergence"].items():
         assert f"| `{task}` | {found['optimum']['expected_losses'][task]:.3f} | {apart:.3f} |" in card
@@ -95,7 +95,7 @@ def test_doorkeys_card_says_what_was_measured():
 
 
 def test_maze2d_acts_as_its_card_says():
-    card = (FOLDERS["maze2d"] / "README.md").read_text()
+    card = " ".join((FOLDERS["maze2d"] / "README.md").read_text().split())
     means = {}
     for name in ("imitation", "return"):
         (task,) = json.loads((ROOT / f"docs/results/maze2d_pretrained_{name}.json").read_text())["per_task"]
