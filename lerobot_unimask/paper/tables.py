@@ -394,7 +394,7 @@ KINDS: dict[str, Callable[..., str]] = {  # how the head begins -> the table of 
     r"models \|.*\| mean": _one_for_all,
     r"task \| policy \| trained for": _trained_as_long,
     r"policy \| trained for": _trained_on_pictures,
-    r"\s*\| h = 1": _remembered,
+    r"\s*\| h = ": _remembered,
     r"H \| carried out": study_tables.acting_table,
     r"delay \| mask": study_tables.real_time_table,
     r"in the maze": study_tables.tasks_table,
