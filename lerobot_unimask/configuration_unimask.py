@@ -139,8 +139,8 @@ class UniMASKConfig(PreTrainedConfig):
     """Architecture: "transformer", or one of the paper's others, "feedforward" and "decision_transformer"."""
     attention: str | None = None
     """How a window is read. "both": training windows are read causally or in both directions, and so are questions:
-    causally where they ask for the next token given all before it, as acting does. "bidirectional" is the paper's,
-    "causal" only acts. None: the network's own way, which is "both" for the transformer."""
+    causally where they ask for the next token given all before it, as acting does, or for what was trained causally.
+    "bidirectional" is the paper's, "causal" only acts. None: the network's own way, "both" for the transformer."""
     causal_share: float = 0.5
     """Share of the training windows that are read causally, with attention=both."""
     token_layout: str = "separate"

@@ -364,9 +364,9 @@ def predict(model: LearntModel, window: Window, mask: Mask, cache: Cache | None 
         return network(window, mask.shown, True, cache, mask.asked)
     if model.config.attention == "causal":
         raise MaskError(
-            "This model attends causally alone. It was trained on "
-            f"{', '.join(model.training_masks.weights)}, and answers for one token given all of that which is shown "
-            "before it. A model of attention=both answers any question.",
+            "This model attends causally alone, and answers what it was trained on, for one token at a time: "
+            f"{', '.join(model.training_masks.weights)} (random_mask: a token given all before it). A model of "
+            "attention=both answers any question.",
             mask.draw(),
         )
     predictions = network(window, mask.shown, False, asked=mask.asked)
